@@ -1,6 +1,6 @@
 """Makes the checkout importable before `tests/service`, whose name would otherwise hide the package `service`.
 
-And keeps what programs leave behind by default out of the home of whoever runs the tests.
+It also keeps the state that programs store by default out of the home of whoever runs the tests.
 """
 
 import gc
@@ -29,19 +29,19 @@ if str(ROOT) not in sys.path:
 
 # A run that a shell has put into the background ignores Ctrl-C, and so would all programs that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-# How long an example takes says what else the computer does, and nothing of the code.
+# The time of an example depends on what else the computer does, not on the code.
 hypothesis.settings.register_profile(
     "any computer", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("any computer")
-# As the programs show it: the library's own way prints every local variable, arrays included, which takes seconds.
+# As in the programs: by default, the library prints every local variable, arrays included, which takes seconds.
 structlog.configure(
     processors=[
         structlog.processors.add_log_level,
         structlog.dev.ConsoleRenderer(colors=False, exception_formatter=structlog.dev.plain_traceback),
     ]
 )
-# A client reads all the certificates this computer trusts, 20 ms of computing, before it knows that it asks over HTTP.
+# A client reads all the certificates this computer trusts, 20 ms of computing, even if it only uses HTTP.
 httpx._transports.default.create_ssl_context = cache(httpx.create_ssl_context)  # type: ignore[attr-defined]
 # A program's commands are put together once, as in a process of its own, and not for every command line.
 typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
@@ -60,7 +60,7 @@ _LONGEST = (
 
 
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
-    """Have workers forked, which makes them start at once, and modules compiled once, and not by each of them."""
+    """Fork workers, so that they start at once, and compile modules once instead of in each worker."""
     from tests.forked_workers import ForkedIO  # noqa: PLC0415  # nobody else needs it
 
     execnet.gateway_io.Popen2IOMaster = ForkedIO  # type: ignore[assignment, misc]
@@ -73,26 +73,26 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
 
 
 def _compile(module: Path, config: pytest.Config) -> None:
-    """Leave a module's code, with its assertions rewritten, where importing it looks for that.
+    """Store a module's code, with its assertions rewritten, where an import looks for it.
 
-    By functions of pytest's that are not public: its version is pinned in constraints.txt.
+    This uses private functions of pytest, whose version is pinned in constraints.txt.
     """
     kept_in = rewrite.get_cache_dir(module)
     kept = kept_in / f"{module.stem}{rewrite.PYC_TAIL}"
     if module.is_file() and rewrite._read_pyc(module, kept) is None and rewrite.try_makedirs(kept_in):
-        with suppress(SyntaxError):  # which is told where the module is imported
+        with suppress(SyntaxError):  # reported when the module is imported
             stat, code = rewrite._rewrite_test(module, config)
             rewrite._write_pyc(config.stash[rewrite.assertstate_key], code, stat, kept)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put first what takes longest, so that nobody waits for it alone at the end; then the modules with many tests."""
+    """Run the slowest modules first, so that none is left alone at the end, then those with many tests."""
     tests = Counter(item.path for item in items)
     ranks = {name: rank for rank, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: (ranks.get(item.path.stem, len(ranks)), -tests[item.path]))
-    gc.freeze()  # what is imported by now stays to the end: nobody need look through it again and again
-    gc.set_threshold(10_000, 20, 20)  # nor through what comes later all the time, 5 % of the computing
+    gc.freeze()  # what is imported by now stays to the end and need not be scanned again and again
+    gc.set_threshold(10_000, 20, 20)  # nor later objects as often, which took 5 % of the computing
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -105,7 +105,7 @@ def _state_folder() -> Iterator[None]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Let go of what a module of tests has simulated and remembered, when it is done."""
+    """Clear the caches of a test module when it is done."""
     if not isinstance(item, pytest.Function) or (
         isinstance(nextitem, pytest.Function) and nextitem.module is item.module
     ):

@@ -1,6 +1,6 @@
-"""Test workers forked off a process that has imported what they, and the programs they start, import.
+"""Test workers forked from a process that has already imported what they and their programs import.
 
-That takes five seconds of computing, otherwise spent by every worker, and again by whatever starts programs for it.
+The imports take five seconds of computing, otherwise spent by every worker and by every process that starts programs.
 """
 
 import atexit
@@ -27,7 +27,7 @@ CONTEXT.set_forkserver_preload(
 
 
 class ForkedIO(Popen2IO):
-    """A worker and the pipes to it, instead of a new Python."""
+    """A forked worker and the pipes to it, in place of a new Python."""
 
     def __init__(self, _: list[str], execmodel: ExecModel) -> None:
         requests, to_worker = CONTEXT.Pipe(duplex=False)

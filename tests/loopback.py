@@ -1,4 +1,4 @@
-"""Free addresses on loopback for tests that run beside each other, and Zenoh sessions there."""
+"""Free addresses on loopback for tests that run in parallel, and Zenoh sessions there."""
 
 import os
 import socket

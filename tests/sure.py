@@ -1,4 +1,4 @@
-"""What a test is sure to find."""
+"""Optional values that a test expects to be there."""
 
 from typing import TypeVar
 
@@ -6,6 +6,6 @@ Found = TypeVar("Found")
 
 
 def sure(value: Found | None) -> Found:
-    """The value, which is there."""
+    """The value, which must not be None."""
     assert value is not None
     return value

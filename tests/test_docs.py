@@ -1,4 +1,4 @@
-"""Untested docs lie: fields, links and commands in the documents are checked against the code."""
+"""Fields and links in the documents are checked against the code and the files."""
 
 import re
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ PAGES = [*sorted(ROOT.glob("*.md")), ROOT / "rotorwatch" / "README.md", *sorted(
 
 
 def fields_of(model: type[BaseModel]) -> Iterator[tuple[str, str | None]]:
-    """Names and descriptions of its fields and of those of its tables."""
+    """Names and descriptions of a model's fields and of those of its tables."""
     for name, field in model.model_fields.items():
         inner = field.annotation
         if isinstance(inner, UnionType):  # a table that may be left out
@@ -53,13 +53,13 @@ def test_every_field_is_documented(pages: tuple[str, ...], models: tuple[type[Ba
 
 
 def anchors_of(page: Path) -> set[str]:
-    """What a link into it may name: its headings, as GitHub writes them."""
+    """The anchors of a page's headings, as GitHub forms them."""
     titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_between_documents_lead_somewhere(page: Path) -> None:
+def test_links_between_documents_resolve(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
         if not target.startswith("http"):

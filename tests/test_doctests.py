@@ -1,6 +1,6 @@
-"""What docstrings show is what happens.
+"""Examples in docstrings give the output they show.
 
-Only modules with an example are imported: as tests of pytest's, all of them would be loaded by each worker.
+Only modules with an example are imported; pytest's own collection would load all of them in each worker.
 """
 
 import doctest
@@ -19,5 +19,5 @@ SHOWING = [
 
 
 @pytest.mark.parametrize("name", SHOWING)
-def test_examples_show_what_happens(name: str) -> None:
+def test_docstring_examples_give_the_output_they_show(name: str) -> None:
     assert not doctest.testmod(import_module(name)).failed

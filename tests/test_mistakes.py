@@ -1,7 +1,7 @@
-"""What people get wrong in files and arguments, and what they are told: ``mistakes/*.toml`` is the table.
+"""Mistakes in files and arguments, and their error messages: ``mistakes/*.toml`` is the table.
 
-A message names the file or argument, the field, the value and what was expected, in a user's words; nothing of the
-libraries inside is in it. To read all of them: ``pytest tests/test_mistakes.py -rA``.
+A message names the file or argument, the field, the value and what was expected, in a user's words, without
+internals of libraries. To read all of them: ``pytest tests/test_mistakes.py -rA``.
 """
 
 import os
@@ -79,7 +79,7 @@ MISTAKES = [
 
 @pytest.fixture
 def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[dict[str, str]]:
-    """A folder with good files, and what stands for ports in the table."""
+    """A folder with good files, and the ports for the placeholders in the table."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     for kind, (_, text) in GOOD.items():
@@ -90,7 +90,7 @@ def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[dict[str,
 
 
 @pytest.mark.parametrize(("kind", "mistake"), MISTAKES)
-def test_a_mistake_is_told_in_the_words_of_who_made_it(
+def test_an_error_states_the_facts_without_library_internals(
     kind: str, mistake: dict[str, Any], ports: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = mistake.get("command") or GOOD[kind][0]
@@ -119,7 +119,7 @@ def test_a_mistake_is_told_in_the_words_of_who_made_it(
     assert len(told.splitlines()) < 12
 
 
-def test_there_is_nothing_to_say_about_the_files_before_a_mistake_is_made(ports: dict[str, str]) -> None:
+def test_files_without_mistakes_are_accepted(ports: dict[str, str]) -> None:
     for kind in ("machine", "settings"):
         assert CliRunner().invoke(rotorwatch, shlex.split(GOOD[kind][0])[1:]).exit_code == 0
 
@@ -133,7 +133,7 @@ def test_a_number_of_thousands_of_digits_is_refused(number: str, told: str, tmp_
         load_machine_file(tmp_path / "machine.toml")
 
 
-def test_a_named_pipe_into_which_nobody_writes_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_named_pipe_without_a_writer_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "service.toml")
     with pytest.raises(MachineFileError, match="is empty"):
         load_settings(tmp_path / "service.toml")

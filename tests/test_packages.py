@@ -1,4 +1,4 @@
-"""What is installed: both wheels are looked into, the code runs where none of it is installed, help comes at once."""
+"""Contents of both wheels; running from a checkout that is not installed; help without heavy imports."""
 
 import shutil
 import subprocess
@@ -27,7 +27,7 @@ HEAVY = {"scipy", "torch", "zenoh", "fastapi", "pyarrow", "mcap"}
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Both wheels by their distribution's name, from a copy: setuptools builds in the tree, and keeps what was."""
+    """Both wheels by their distribution's name, from a copy: setuptools builds in the tree, and keeps old files."""
     copy, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheels")
     for package in PACKAGES:
         left_out = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
@@ -44,7 +44,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Everything that is installed here, but for rotorwatch."""
+    """Everything that is installed here except rotorwatch."""
     folder = tmp_path_factory.mktemp("others")
     for entry in Path(sysconfig.get_path("purelib")).iterdir():
         if "rotorwatch" not in entry.name and entry.suffix != ".pth":
@@ -62,7 +62,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def in_new_process(code: str, *paths: Path, cwd: Path, arguments: tuple[str, ...] = ()) -> str:
-    """Run code that finds the standard library and these folders, and no installed package; what it printed."""
+    """Run code with only the standard library and these folders on its path, and return what it printed."""
     begin = f"import sys; sys.path[:0] = {[str(path) for path in paths]}; "
     done = subprocess.run(
         [sys.executable, "-I", "-S", "-c", begin + code, *arguments], cwd=cwd, capture_output=True, text=True,
@@ -96,16 +96,14 @@ def files_of(*packages: str) -> set[str]:
     }
 
 
-def test_one_wheel_brings_the_programs_with_all_their_files_and_the_client_is_one_of_its_own(
-    wheels: dict[str, Path],
-) -> None:
+def test_one_wheel_holds_all_files_of_the_programs_and_another_the_client(wheels: dict[str, Path]) -> None:
     assert set(contents(wheels["rotorwatch"])) == files_of(*PACKAGES)
     assert set(contents(wheels["rotorwatch_client"])) == files_of("rotorwatch")
     needed = [line for line in requirements(wheels["rotorwatch_client"]) if "extra" not in line]
     assert {line.split("<")[0].split(">")[0] for line in needed} == {"httpx", "httpx-sse", "pydantic"}
 
 
-def test_both_wheels_say_version_and_licence_and_agree_on_what_they_need(wheels: dict[str, Path]) -> None:
+def test_both_wheels_state_version_and_licence_and_agree_on_requirements(wheels: dict[str, Path]) -> None:
     for wheel in wheels.values():
         found = metadata(wheel)
         assert (found["Version"], found["License-Expression"]) == (rotorwatch.__version__, "Apache-2.0")
@@ -131,7 +129,7 @@ def test_the_installed_client_loads_no_server(wheels: dict[str, Path], others: P
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_programs_run_from_a_checkout_that_is_not_installed_and_say_their_version(
+def test_programs_run_from_an_uninstalled_checkout_and_state_their_version(
     checkout: Path, others: Path, tmp_path: Path, program: str
 ) -> None:
     code = f"from {PROGRAMS[program]} import app; app(prog_name='{program}')"
@@ -139,9 +137,7 @@ def test_programs_run_from_a_checkout_that_is_not_installed_and_say_their_versio
     assert said == f"{program} {rotorwatch.__version__}"
 
 
-def test_a_mere_checkout_is_imported_and_commissions_without_torch(
-    checkout: Path, others: Path, tmp_path: Path
-) -> None:
+def test_an_uninstalled_checkout_is_imported_without_torch(checkout: Path, others: Path, tmp_path: Path) -> None:
     code = (
         "import importlib.metadata as m, simulator.commission.command; print('torch' in sys.modules); "
         "import service.runtime.runtime; "
@@ -158,7 +154,7 @@ def test_a_mere_checkout_is_imported_and_commissions_without_torch(
         ("rotortrain", ["train"], HEAVY | {"numpy"}, ("rotortrain train --machine lab",)),
     ],
 )
-def test_help_waits_for_nothing_heavy(program: str, command: list[str], heavy: set[str], said: tuple[str, ...]) -> None:
+def test_help_imports_nothing_heavy(program: str, command: list[str], heavy: set[str], said: tuple[str, ...]) -> None:
     code = f"import sys\nfrom {PROGRAMS[program]} import app\n"
     code += f"try:\n    app([*{command}, '--help'])\nexcept SystemExit:\n    print(*{heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

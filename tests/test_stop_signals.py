@@ -1,4 +1,4 @@
-"""Signals stop the programs wherever they find them, in the middle of a wait as well, or while they load."""
+"""Signals stop the programs at any moment, also in the middle of a wait or while they load."""
 
 import os
 import signal
@@ -36,7 +36,7 @@ def test_a_signal_in_the_middle_of_a_wait_stops(module: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(("ignored", "stopped"), [(False, True), (True, False)], ids=["terminal", "nohup"])
-def test_a_terminal_that_is_closed_stops_in_order(ignored: bool, stopped: bool) -> None:
+def test_closing_the_terminal_requests_a_stop_unless_it_is_ignored(ignored: bool, stopped: bool) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
     try:
         with stop_request() as stop:

@@ -1,4 +1,4 @@
-"""The tutorial: every command in it is run, and what it says of the rotor is so."""
+"""The tutorial: every command in it is run, and its statements about the rotor are checked."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def full(folder: Path, name: str) -> list[dict[str, Any]]:
     return [report for report in messages(folder, name, "/report") if report["filled"] == 1.0]
 
 
-def test_nothing_is_raised_on_the_healthy_half_that_was_not_seen(folder: Path) -> None:
+def test_the_unseen_healthy_half_raises_no_alarm(folder: Path) -> None:
     found = full(folder, "healthy")
     assert len(found) > 15
     assert {report["state"] for report in found} == {"healthy"}
@@ -74,12 +74,12 @@ def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["healthy", "changed"])
-def test_what_is_said_of_it_is_what_was_said(folder: Path, name: str) -> None:
+def test_the_output_of_the_tutorial_is_as_pinned(folder: Path, name: str) -> None:
     lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
     assert differences(f"tutorial_{name}", lines) == []
 
 
-def test_what_the_commissioning_said_is_on_the_page(folder: Path) -> None:
+def test_the_page_quotes_the_results_of_the_commissioning(folder: Path) -> None:
     report = json.loads((folder / "bundle" / "report.json").read_text(encoding="utf-8"))
     assert (report["level"], report["verdict"]) == ("none", "limited")
     loss = {one["name"]: one["detectable_loss"] for one in report["parameters"]}

@@ -19,7 +19,7 @@ def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterat
 
 
 def fed(plan: Plan, samples: FloatArray) -> SlidingWindow:
-    """After these samples, in the units of the machine, as one piece."""
+    """The sliding window after these samples, in the units of the machine, fed as one piece."""
     window = SlidingWindow(plan)
     tuple(window.feed(plan.to_si(samples), 0))
     return window

@@ -1,4 +1,4 @@
-"""Healthy recordings of the shipped rotor kit, and machine files that tell less of it than is known."""
+"""Healthy recordings of the shipped rotor kit, and machine files that omit part of what is known."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -29,11 +29,11 @@ def _less(machine: Machine) -> tuple[MachineFile, MachineFile]:
 
 
 NOTHING, PARTIAL = _less(LAB)
-"""The rotor kit with channels and sampling alone, and with masses and shaft besides."""
+"""The rotor kit with only channels and sampling, and with masses and shaft as well."""
 
 
 def elsewhere(machine: MachineFile) -> MachineFile:
-    """The same with its sensors on the casing, where they measure no motion that is modelled."""
+    """The machine with its sensors on the casing, where they measure no modelled motion."""
     moved = [
         one if one.quantity == "shaft_angle" else one.model_copy(update={"location": "casing"})
         for one in machine.sensors
@@ -42,7 +42,7 @@ def elsewhere(machine: MachineFile) -> MachineFile:
 
 
 def mounted(machine: Machine, at: dict[str, tuple[float, float]]) -> Machine:
-    """The machine with its probes of some states' names (``y1``) turned: those in y and z to these angles."""
+    """The machine with the probe pairs named by their first state (``y1``) turned to these angles in degrees."""
     fields = machine.model_dump()
     for sensor in fields["sensors"]:
         for first, angles in at.items():
@@ -55,7 +55,7 @@ def mounted(machine: Machine, at: dict[str, tuple[float, float]]) -> Machine:
 
 @cache
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
-    """Blocks of the shipped healthy scenario with events of one's own."""
+    """Blocks of the shipped healthy scenario with these events."""
     scenario, machine = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
     return tuple(block for block, _ in blocks(scenario, machine))
@@ -78,7 +78,7 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
 def with_sensors(
     machine: MachineFile, stream_: Sequence[SampleBlock], kept: Callable[[Sensor], bool]
 ) -> tuple[MachineFile, list[SampleBlock]]:
-    """The machine with some of its sensors alone, and what they measure."""
+    """The machine and its blocks, reduced to the sensors to keep."""
     columns = [number for number, sensor in enumerate(machine.sensors) if kept(sensor)]
     sensors = tuple(machine.sensors[number] for number in columns)
     blocks_ = [replace(block, samples=block.samples[:, columns]) for block in stream_]
@@ -94,7 +94,7 @@ def without_angle(stream_: Sequence[SampleBlock]) -> list[SampleBlock]:
 
 
 def blind(machine: MachineFile, times: float = 1.0) -> MachineFile:
-    """The machine without its shaft angle, and with a file that is wrong about the unbalance."""
+    """The machine without its shaft angle, and with the unbalance in its file multiplied by `times`."""
     assert machine.rotor is not None
     e_m = machine.rotor.e_m
     rotor = machine.rotor.model_copy(update={"e_m": None if e_m is None else times * e_m})
@@ -103,7 +103,7 @@ def blind(machine: MachineFile, times: float = 1.0) -> MachineFile:
 
 
 def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 60e-6) -> list[SampleBlock]:
-    """The same on a floor that another machine shakes: the disc moves by 60 um."""
+    """The blocks with the floor shaken by another machine: the disc moves by 60 µm."""
     samples = samples_of(stream_)
     turned = 2 * np.pi * line_hz * np.arange(len(samples)) / LAB.rate_hz
     for column, channel in enumerate(LAB.sensors[:8]):
@@ -114,7 +114,7 @@ def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 6
 
 
 def with_lines(stream_: Sequence[SampleBlock], parts: Mapping[float, float], order: float = 0.0) -> list[SampleBlock]:
-    """The same with lines of these frequencies, Hz, and parts of each channel's rms, or at an order with part 0.05."""
+    """The blocks with lines: `parts` maps Hz to parts of each channel's rms; that at `order` has part 0.05."""
     samples = samples_of(stream_)
     spread, at_s = samples[:, :8].std(axis=0), np.arange(len(samples)) / LAB.rate_hz
     phases = np.random.default_rng(5200).uniform(0, 2 * np.pi, 8)

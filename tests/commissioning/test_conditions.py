@@ -1,4 +1,4 @@
-"""Several healthy recordings: whether they were excited in different ways, and one baseline or one for each speed."""
+"""Several healthy recordings: whether their excitation differs, and one baseline for all or one per speed."""
 
 from dataclasses import replace
 from functools import cache
@@ -61,7 +61,7 @@ def test_two_speeds_of_one_machine_make_one_baseline() -> None:
 
 
 @pytest.mark.slow
-def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
+def test_a_speed_dependent_bearing_gets_one_baseline_per_speed() -> None:
     stiffer = Event(at_s=0.0, parameter="k_by", relative_change=0.3)
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST), stiffer)))
     verdict, text, _ = told_of(made, "recordings agree")
@@ -99,14 +99,14 @@ def checked(*recordings: WindowStatistics) -> Check:
     return check_sources({f"{number}.mcap": [one] for number, one in enumerate(recordings)})
 
 
-def test_recordings_of_one_condition_are_one_way_of_excitation() -> None:
+def test_recordings_of_one_condition_count_as_one_excitation() -> None:
     assert "in the only recording" in checked(window(0, 1)).text
     alike = checked(window(0, 1), window(0, 2))
     assert alike.verdict == "limited"
     assert "in the same way in all 2 recordings" in alike.text
 
 
-def test_another_source_or_another_speed_is_another_way() -> None:
+def test_another_source_or_speed_counts_as_a_second_excitation() -> None:
     faster = replace(window(0, 2), speed_rad_s=1.1 * LAB.operation.speed_rad_s)
     for other in (window(1, 3), faster):
         assert checked(window(0, 1), other).verdict == "passed"

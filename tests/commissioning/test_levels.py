@@ -1,4 +1,4 @@
-"""What is learned at each level of knowledge, and that it comes back from its file."""
+"""What is learned at each level of knowledge, and its round trip through the file."""
 
 import json
 import re
@@ -57,12 +57,12 @@ MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
 
 @cache
 def made_at(level: str) -> Commissioning:
-    """The rotor kit commissioned on one recording, as much of it known as this level of knowledge says."""
+    """The rotor kit commissioned on one recording at this level of knowledge."""
     return commissioned(MACHINES[level], healthy(MACHINES[level], HEALTHY_S if level == "none" else 70.0, 41))
 
 
 def assert_identified(made: Commissioning, names: Sequence[str]) -> list[float]:
-    """That these parameters are within four standard errors of the true ones, which it returns."""
+    """Assert that these parameters are within four standard errors of the truth; return the standard errors."""
     errors = np.sqrt(np.diag(sure(sure(made.commissioned).identified).matrix())).tolist()
     for name, error in zip(names, errors, strict=False):
         found, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (sure(made.machine), LAB))
@@ -70,7 +70,7 @@ def assert_identified(made: Commissioning, names: Sequence[str]) -> list[float]:
     return list(errors)
 
 
-def test_a_machine_file_says_how_much_is_known() -> None:
+def test_the_knowledge_level_follows_from_the_machine_file() -> None:
     assert (knowledge_of(LAB).level, knowledge_of(PARTIAL).level) == (KnowledgeLevel.FULL, KnowledgeLevel.PARTIAL)
     assert "k_by_N_per_m, k_bz_N_per_m, c_by_N_s_per_m, c_bz_N_s_per_m, e_m" in knowledge_of(PARTIAL).text
     assert knowledge_of(NOTHING).level is KnowledgeLevel.NONE
@@ -83,7 +83,7 @@ def test_a_machine_file_says_how_much_is_known() -> None:
 
 
 @pytest.mark.parametrize("known", [LAB, NOTHING])
-def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(known: MachineFile) -> None:
+def test_without_motion_sensors_only_levels_are_commissioned(known: MachineFile) -> None:
     machine = elsewhere(known)
     assert install(machine, None).watching
     made = sure(commissioned(machine, healthy(machine, 70.0, 60106)).commissioned)
@@ -99,7 +99,7 @@ def test_where_no_motion_is_measured_levels_are_all_there_is_whatever_is_known(k
     assert "y1_dot: repeated the value 0.3 mm/s" in report.summary
 
 
-def test_a_heavy_spot_at_another_angle_than_in_the_file_is_refused_with_its_angle() -> None:
+def test_a_wrong_heavy_spot_angle_in_the_file_is_refused_with_the_measured_one() -> None:
     operation = LAB.operation.model_copy(update={"unbalance_phase_rad": 1.5})
     elsewhere_now = LAB.model_copy(update={"operation": operation})
     report = commissioned(elsewhere_now, healthy(LAB, 75.0, 4_910_011)).report
@@ -108,8 +108,8 @@ def test_a_heavy_spot_at_another_angle_than_in_the_file_is_refused_with_its_angl
     assert "unbalance_phase_rad = " in report.summary
 
 
-def test_lines_of_the_healthy_machine_hide_no_rotor() -> None:
-    """A gear, hum, and the second harmonic that every real machine has: theory knows none of them."""
+def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
+    """The lines are of a gear, hum, and the second harmonic of every real machine: theory has none of them."""
     made = commissioned(PARTIAL, recording(PARTIAL, with_lines(stream(70.0, 41), {50.03: 0.1, 37.3: 0.1}, order=2)))
     found = sure(made.commissioned)
     assert {round(line_hz) for line_hz, _ in found.lines} == {37, 44, 50}
@@ -119,7 +119,7 @@ def test_lines_of_the_healthy_machine_hide_no_rotor() -> None:
 
 @pytest.mark.parametrize("machine", [blind(LAB, 1.5), pytest.param(blind(PARTIAL), marks=pytest.mark.slow)])
 def test_without_a_shaft_angle_the_unbalance_is_identified_by_its_size(machine: MachineFile) -> None:
-    """Whatever the file says of it; what grows later is named."""
+    """A wrong value in the file does no harm, and only the later growth is alarmed."""
     made = commissioned(machine, recording(machine, without_angle(stream(130.0, 5_570_010))))
     identified = sure(sure(made.commissioned).identified)
     error = np.sqrt(identified.matrix()[PARAMETERS.index("e"), PARAMETERS.index("e")])
@@ -133,7 +133,7 @@ def test_without_a_shaft_angle_the_unbalance_is_identified_by_its_size(machine: 
     assert abs(sure(next(one for one in first.parameters if one.name == "e").z)) < 4
 
 
-def test_without_a_shaft_angle_windows_of_two_unbalances_identify_none() -> None:
+def test_without_a_shaft_angle_differing_unbalances_are_not_identified() -> None:
     machine = blind(LAB)
     sizes = [(), (Event(at_s=0.0, parameter="e", relative_change=0.5),)]
     two = [recording(machine, without_angle(stream(70.0, 5_570_020 + n, *one))) for n, one in enumerate(sizes)]
@@ -156,7 +156,7 @@ def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     assert k_by.identified == machine.rotor.k_by_N_per_m
 
 
-def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
+def test_later_misfit_is_judged_relative_to_that_of_healthy_windows() -> None:
     rng, names = np.random.default_rng(4_501), ("mass of the disc", "gain of y1", "gain of z1")
     off = np.array([4.0, -2.5, 0.0])
 
@@ -167,7 +167,7 @@ def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
 
     before, judged, changed = [], [], []
     for _ in range(1500):
-        # Windows of half the monitor's length, and then one as long.
+        # Healthy windows of half the monitor's length, then a window of its full length.
         healthy = sure(HealthyMisfit.of([window(0.5) for _ in range(8)], [0.5] * 8))
         assert (healthy.error, healthy.excess_error) == pytest.approx((0.5, 0.5**0.5))
         before.append(window(1.0).misfit_z)
@@ -176,15 +176,15 @@ def test_a_later_window_is_judged_by_how_the_healthy_ones_were_off() -> None:
     assert np.mean(before) > 2.5
     assert (np.array(judged) > 2.0).mean() < 0.023 + 4 * (0.023 / 1500) ** 0.5
     assert np.mean(judged) > -0.5
-    # What deviates otherwise shows, though it is no larger than what was there.
+    # A deviation of another kind shows, though it is no larger than the healthy one.
     assert np.mean([one.misfit_z > 4.0 for one in changed]) > 0.8
     suspects = {one.suspect.partition(" (")[0] for one in changed}
     assert suspects <= {"gain of z1", ""}
     assert HealthyMisfit.of([], []) is None
 
 
-def test_a_misfit_that_differs_with_what_shakes_the_machine_is_none_of_a_later_window() -> None:
-    """A gain that is a little off stands out where one force moves everything, and hardly where several do."""
+def test_a_healthy_misfit_that_varies_with_excitation_is_tolerated_later() -> None:
+    """A slightly wrong gain stands out under a single force, and hardly under several."""
     rng, names = np.random.default_rng(4_502), ("gain of y1", "gain of z1")
 
     def window(gain: float, other: float = 0.0) -> Goodness:
@@ -202,7 +202,7 @@ def test_a_misfit_that_differs_with_what_shakes_the_machine_is_none_of_a_later_w
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["partial", pytest.param("full", marks=pytest.mark.long)])
-def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later_window(level: str) -> None:
+def test_a_misfit_of_the_healthy_machine_is_no_misfit_of_a_later_window(level: str) -> None:
     made, machine = sure(made_at(level).commissioned), MACHINES[level]
     assert made.misfit is not None
     assert "misfit" not in json.loads(made.model_copy(update={"misfit": None}).model_dump_json())
@@ -228,7 +228,7 @@ def test_a_misfit_that_was_there_when_the_machine_was_healthy_is_none_of_a_later
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["partial", "none", pytest.param("full", marks=pytest.mark.long)])
-def test_what_was_commissioned_comes_back_from_its_file(level: str, tmp_path: Path) -> None:
+def test_a_commissioned_bundle_round_trips_through_its_file(level: str, tmp_path: Path) -> None:
     made, machine = made_at(level), MACHINES[level]
     assert made.commissioned is not None
     assert made.report.level == level
@@ -277,7 +277,7 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
         load_commissioned(tmp_path, NOTHING)
 
 
-def test_outside_the_commissioned_conditions_is_said_so() -> None:
+def test_conditions_outside_the_commissioned_range_are_named() -> None:
     windows = windows_of(healthy(NOTHING, HEALTHY_S, 41))
     conditions, naming = OperatingRange.of(windows), Naming(NOTHING.sensors)
     assert all(conditions.outside(window, naming) == "" for window in windows)
@@ -290,7 +290,7 @@ def test_outside_the_commissioned_conditions_is_said_so() -> None:
 
 
 @pytest.mark.slow
-def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> None:
+def test_a_longer_recording_lowers_commissioning_errors_and_detectable_changes() -> None:
     little = commissioned(NOTHING, healthy(NOTHING, 46.0, 46))
     much = made_at("none")
     for one, other in zip(little.report.parameters[:4], much.report.parameters[:4], strict=True):
@@ -300,7 +300,7 @@ def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> 
 
 
 @pytest.mark.slow
-def test_the_valid_band_of_what_is_derived_is_stated() -> None:
+def test_a_note_states_the_valid_band_of_the_derivatives() -> None:
     note, linear = made_at("none").report.notes
     assert linear.startswith("The relations are linear.")
     found = sure(re.search(r"up to (\d) derivatives .* valid from 0 to (\d+) Hz", note))

@@ -1,4 +1,4 @@
-"""Steady lines of the healthy machine, such as hum, are taken out of what relations are learned on and read in."""
+"""Steady lines of the healthy machine, such as hum, are removed before relations are learned or windows read."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -46,7 +46,7 @@ def made(*, lines: bool) -> Commissioned:
     return sure(commissioned(NOTHING, recording(NOTHING, recorded(lines=lines))).commissioned)
 
 
-def test_lines_are_taken_out_of_correlations_at_all_lags_once() -> None:
+def test_lines_are_removed_from_correlations_at_all_lags_exactly_once() -> None:
     for clean, window in zip(healthy(lines=False), healthy(lines=True), strict=True):
         spread = np.sqrt(np.diag(clean.correlation[0]))
         there, left = (
@@ -58,7 +58,7 @@ def test_lines_are_taken_out_of_correlations_at_all_lags_once() -> None:
         np.testing.assert_allclose(again.hop_correlation.mean(axis=0), again.correlation, atol=1e-6 * spread.max() ** 2)
 
 
-def test_a_rotor_is_learned_as_if_there_were_none() -> None:
+def test_relations_learned_with_lines_agree_with_those_learned_without() -> None:
     assert {round(line_hz) for line_hz, _ in made(lines=True).lines} == {44, 50, 100, 150}
     assert made(lines=False).lines == ()
     own, seen = (made(lines=lines).baselines[0].baseline.baseline().relations for lines in (False, True))
@@ -67,10 +67,10 @@ def test_a_rotor_is_learned_as_if_there_were_none() -> None:
         assert np.all(np.abs(other.coefficients - one.coefficients) < 0.2 * errors)  # 1.8 with the lines
 
 
-def test_later_windows_are_read_without_them_where_the_relations_were_learned_so() -> None:
+def test_windows_are_read_without_lines_if_relations_were_learned_without_them() -> None:
     hops = recording(NOTHING, recorded(lines=True))
     window = window_statistics(hops.plan, hops.hops[: hops.plan.hops], lines=made(lines=True).lines)
-    before = made(lines=True).model_copy(update={"lines": ()})  # of a version that learned on all that there was
+    before = made(lines=True).model_copy(update={"lines": ()})  # of a version that did not remove lines
     with_them, without = (
         BaselineEvaluator(NOTHING, one).evaluate(seen)
         for one, seen in ((before, window), (before, window.without_lines))
@@ -80,8 +80,8 @@ def test_later_windows_are_read_without_them_where_the_relations_were_learned_so
     assert now.deciding.parameters != with_them.deciding.parameters
 
 
-def test_a_rotor_is_identified_from_a_guess_without_them() -> None:
-    """Of displacements alone the guess was far off, and commissioning at level partial was refused for it."""
+def test_identification_starts_from_a_guess_without_the_lines() -> None:
+    """From displacements alone the guess used to be far off, so that commissioning at level partial was refused."""
     known = {"m1_kg": 2.5, "m2_kg": 4.0, "I2_kg_m2": 9e-3, "I2p_kg_m2": 0.0162, "shaft_length_m": 0.22}
     known |= {"shaft_diameter_m": 0.018}
     own = {"k_by_N_per_m": 4.5e5, "k_bz_N_per_m": 6e5, "c_by_N_s_per_m": 180.0, "c_bz_N_s_per_m": 200.0}

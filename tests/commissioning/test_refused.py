@@ -44,7 +44,7 @@ def made_of(blocks: Sequence[SampleBlock], machine: MachineFile = NOTHING) -> Co
 
 
 def spoilt(change: Callable[[FloatArray], object]) -> Commissioning:
-    """Of a recording whose samples are changed in place."""
+    """Commission on a recording whose samples `change` alters in place."""
     blocks = stream(HEALTHY_S, 52)
     samples = samples_of(blocks)
     change(samples)
@@ -65,7 +65,7 @@ def turning_back(samples: FloatArray) -> None:
 
 
 def of_displacements(order: Sequence[str], sign: str = "") -> Commissioning:
-    """The rotor kit with one sensor per motion, columns in another order than said, or one with the wrong sign."""
+    """The rotor kit with one sensor per motion, columns in another order than stated, or one with the wrong sign."""
     machine, blocks = with_sensors(NOTHING, stream(150.0, 58), no_velocity)
     names = [sensor.name for sensor in machine.sensors]
     samples = samples_of(blocks)[:, [names.index(name) for name in order]]
@@ -134,8 +134,8 @@ NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the 
         *("another machine", "window", "no such rotor", "swapped at 1", "swapped at 2", "exchanged", "wrong sign"),
     ],
 )  # fmt: skip
-def test_what_is_not_fit_is_refused_with_what_to_do(make: Callable[[], Commissioning], told: dict[str, str]) -> None:
-    """What is checked by name, or anywhere in the summary."""
+def test_an_unfit_recording_is_refused_with_advice(make: Callable[[], Commissioning], told: dict[str, str]) -> None:
+    """Texts expected of each check by name; an empty name stands for the summary."""
     made = make()
     assert made.commissioned is None
     assert made.report.verdict == "refused"
@@ -145,14 +145,14 @@ def test_what_is_not_fit_is_refused_with_what_to_do(make: Callable[[], Commissio
 
 
 @pytest.mark.parametrize(("hops", "verdict"), [(71, "passed"), (70, "limited")])
-def test_a_file_as_long_as_six_windows_is_enough_although_its_first_hop_fills_the_lags(hops: int, verdict: str) -> None:
+def test_six_windows_less_the_hop_that_fills_the_lags_are_enough_data(hops: int, verdict: str) -> None:
     one = recording(NOTHING, stream(60.0, 51))
     assert len(one.hops) == 11
     check = check_data(NOTHING, [replace(one, stretches=((one.hops * 7)[:hops],))])
     assert check.verdict == verdict
 
 
-def test_blocks_of_other_channels_are_imported_again() -> None:
+def test_the_advice_for_blocks_of_another_schema_is_to_import_again() -> None:
     check = check_data(
         NOTHING, [HealthyRecording("monday.mcap", plan_for(NOTHING), (), 0, 0.0, (("schema", 9),), "hash")]
     )
@@ -164,7 +164,7 @@ def test_one_sensor_for_each_motion_is_enough() -> None:
 
 
 @pytest.mark.slow
-def test_a_few_gaps_are_told_and_cost_their_hops() -> None:
+def test_a_short_gap_is_reported_and_does_not_prevent_commissioning() -> None:
     kept = [block for number, block in enumerate(stream(HEALTHY_S, 52)) if number != 700]
     made = made_of(kept)
     assert made.commissioned is not None
@@ -172,7 +172,7 @@ def test_a_few_gaps_are_told_and_cost_their_hops() -> None:
 
 
 @pytest.mark.parametrize(("bits", "limit", "verdict"), [(16, 2.8, "limited"), (16, 5.0, "passed"), (8, 5.0, "passed")])
-def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: float, verdict: str) -> None:
+def test_a_channel_at_the_end_of_its_range_is_reported(bits: int, limit: float, verdict: str) -> None:
     def converted(samples: FloatArray) -> None:
         end = limit * samples[:, 0].std()
         step = end / 2 ** (bits - 1)
@@ -183,7 +183,7 @@ def test_a_channel_that_reaches_the_end_of_its_range_is_told(bits: int, limit: f
     assert ("y1 is at exactly" in text) == (verdict == "limited")
 
 
-def test_another_machine_that_hums() -> None:
+def test_a_line_from_a_neighbouring_machine_is_named() -> None:
     disturbed = humming(stream(HEALTHY_S, 56), 48.6, bearing_m=20e-6)
     verdict, text, advice = told_of(made_of(disturbed), "second excitation")
     assert verdict in {"limited", "refused"}
@@ -196,7 +196,7 @@ def test_another_machine_that_hums() -> None:
 
 @pytest.mark.slow
 def test_a_healthy_recording_has_no_foreign_line() -> None:
-    """Which the check says of the recording before anything is learned from it."""
+    """The check looks at the recording before anything is learned from it."""
     for seed in (52, 58):
         assert check_lines(NOTHING, [recording(NOTHING, stream(HEALTHY_S, seed))]).verdict == "passed"
 
@@ -205,7 +205,7 @@ def test_a_healthy_recording_has_no_foreign_line() -> None:
     ("off", "limit", "verdict"), [(-0.003, 0.1, "passed"), (0.04, 0.1, "refused"), (0.04, 0.2, "passed")]
 )
 def test_a_difference_far_below_the_alarm_limit_is_no_reason_to_refuse(off: float, limit: float, verdict: str) -> None:
-    """However many standard errors it is: one force that moves everything makes them as small as that."""
+    """However many standard errors it amounts to: a single force makes them that small."""
     limits = LAB.alarms.limits.model_copy(update={"raise_above": limit})
     machine = LAB.model_copy(update={"alarms": LAB.alarms.model_copy(update={"parameters": {"k_by": limits}})})
     read = tuple(
@@ -219,7 +219,7 @@ def test_a_difference_far_below_the_alarm_limit_is_no_reason_to_refuse(off: floa
 
 
 @pytest.mark.slow
-def test_sensors_that_allow_no_equation_are_limited_to_changed_or_not() -> None:
+def test_without_equations_channels_are_only_judged_changed_or_not() -> None:
     machine, blocks = with_sensors(NOTHING, stream(250.0, 60), lambda sensor: sensor.location != "disc")
     made = made_of(blocks, machine)
     verdict, text, advice = told_of(made, "equations")
@@ -234,7 +234,7 @@ def test_sensors_that_allow_no_equation_are_limited_to_changed_or_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_rate_too_low_for_relations_leaves_the_shapes_of_the_channels() -> None:
+def test_a_rate_too_low_for_equations_leaves_only_channel_shapes() -> None:
     fields = NOTHING.model_dump(exclude={"window"}) | {"rate_hz": 500.0}
     machine = MachineFile.model_validate(fields)
     blocks = [replace(b, rate_hz=500.0, samples=b.samples[::4]) for b in stream(250.0, 60)]
@@ -247,7 +247,7 @@ def test_a_rate_too_low_for_relations_leaves_the_shapes_of_the_channels() -> Non
     assert made.commissioned.shape is not None
 
 
-def test_the_usual_lag_spacing_fits_every_rate() -> None:
+def test_the_default_lag_spacing_is_a_whole_number_of_samples() -> None:
     fields = NOTHING.model_dump(exclude={"window"}) | {"rate_hz": 2560.0}
     machine = MachineFile.model_validate(fields)
     assert machine.window.lag_step_s == 3 / 2560
@@ -269,7 +269,7 @@ def _shaped(count: int, varies: float = 1.0) -> HealthyShape:
     ("count", "varies", "verdict"),
     [(30, 1.0, "passed"), (6, 1.0, "limited"), (4, 1.0, "refused"), (4, 20.0, "refused"), (90, 1e6, "limited")],
 )
-def test_shapes_without_power_are_no_commissioning(count: int, varies: float, verdict: str) -> None:
+def test_channel_shapes_are_judged_by_their_power(count: int, varies: float, verdict: str) -> None:
     shape = _shaped(count, varies)
     powers = shape.powers(3e-6)
     check = check_shapes(NOTHING, powers, count)
@@ -293,10 +293,10 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
         (6600, None, True),
         (6600, Operation(speed_rpm=3000), True),
         (6600, Operation(speed_rpm=6600), False),
-        (6600, Operation(speed_rpm=4500, speed_tolerance=0.6), False),  # of a drive with variable speed
+        (6600, Operation(speed_rpm=4500, speed_tolerance=0.6), False),  # a variable-speed drive
     ],
 )
-def test_a_fast_machine_has_to_say_so(rpm: float, given: Operation | None, refused: bool) -> None:
+def test_a_fast_machine_must_have_its_speed_in_the_file(rpm: float, given: Operation | None, refused: bool) -> None:
     machine = NOTHING.model_copy(update={"operation": given})
     windows = [replace(window, speed_rad_s=rpm * np.pi / 30) for window in windows_of(healthy(NOTHING, HEALTHY_S, 55))]
     found = check_speed_given(machine, windows)
@@ -309,7 +309,7 @@ def test_a_fast_machine_has_to_say_so(rpm: float, given: Operation | None, refus
 
 
 @pytest.mark.parametrize(("turned_rad", "verdict"), [(0.02, "passed"), (0.2, "refused")])
-def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float, verdict: str) -> None:
+def test_agreement_of_the_unbalance_is_judged_by_its_vector(turned_rad: float, verdict: str) -> None:
     vector = UnbalanceVector(np.cos(turned_rad), np.sin(turned_rad), 1e-7, 0.0, 1e-7)
     change = vector.change if vector.turned else vector.magnitude_change
     read = (parameter_reading("e", "likelihood", change, 3e-4, vector),)
@@ -324,7 +324,7 @@ def test_an_unbalance_that_is_elsewhere_differs_by_its_vector(turned_rad: float,
         ("delay of y1", 4e-5, "limited"), ("delay of y1", 3e-4, "refused"), ("mass of the disc", 0.02, "refused"),
     ],
 )  # fmt: skip
-def test_a_sensor_that_is_a_degree_off_its_axis_or_a_little_late_makes_no_other_machine(
+def test_a_slightly_turned_or_late_sensor_does_not_refuse_the_machine_file(
     tried: str, change: float, verdict: str
 ) -> None:
     read = (parameter_reading("k_by", "likelihood", 0.0, 3e-4),)

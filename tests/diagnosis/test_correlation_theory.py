@@ -1,4 +1,4 @@
-"""Estimated correlations and spectra of the simulated machine against the Ljapunov theory."""
+"""Estimated correlations and spectra of the simulated machine against the Lyapunov theory."""
 
 import numpy as np
 import pytest
@@ -41,8 +41,8 @@ def test_correlation_functions_and_synchronous_vectors_agree_with_theory(
 ) -> None:
     """Twelve independent windows: every correlation at every lag within 5.5 standard errors of their mean.
 
-    8064 correlated comparisons with t-distributed deviations of 11 degrees of freedom: 5.5 is exceeded twice in ten
-    thousand runs of a single one, so a handful may be; 0.1 % of them.
+    Each of 8064 correlated comparisons, t-distributed with 11 degrees of freedom, exceeds 5.5 twice in ten thousand
+    runs, so a handful may: 0.1 % of them.
     """
     speed = next(event.speed_rpm for event in condition.events if event.speed_rpm is not None) * 2 * np.pi / 60
     A, B = expanded_A(MACHINE.rotor, speed, condition.sources), expanded_B(condition.sources)

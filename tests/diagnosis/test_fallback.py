@@ -1,4 +1,4 @@
-"""Shapes of correlation functions against their healthy spread: changed or not, at a declared rate, and no names."""
+"""Shapes of correlation functions against their healthy spread: changed or not, at a declared rate, without a cause."""
 
 from dataclasses import replace
 from functools import cache
@@ -53,7 +53,7 @@ def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_w
         assert 0.2 < np.mean(channel > 0) < 0.8  # neither blind nor crying wolf
 
 
-def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
+def test_a_20_per_cent_loss_of_stiffness_is_detected_but_not_named() -> None:
     shape = learn_shape(recorded(1, 6))
     for window in recorded(2, 8, change=-0.2):
         judged = shape.judge(window)
@@ -66,7 +66,7 @@ def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
 
 
 @pytest.mark.slow
-def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
+def test_learning_under_varied_excitation_widens_the_healthy_spread() -> None:
     one_colour = learn_shape(recorded(1, 6))
     other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]
     assert sum(any(one.verdict == "changed" for one in one_colour.judge(window)) for window in other_colours) > 12
@@ -78,7 +78,7 @@ def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
     assert binomtest(flagged, 12, 0.05, alternative="greater").pvalue > 0.005
 
 
-def test_fewer_healthy_windows_and_shorter_ones_ask_for_a_larger_change() -> None:
+def test_fewer_healthy_windows_or_a_shorter_window_lower_the_z_value() -> None:
     healthy, (changed, *_) = recorded(1, 6), recorded(2, 8, change=-0.2)
     shape = learn_shape(healthy)
     known = sure(shape.judge(changed)[0].z)
@@ -92,13 +92,13 @@ def replace_windows(shape: HealthyShape, count: int) -> HealthyShape:
     return HealthyShape.model_validate(shape.model_dump() | {"windows": count})
 
 
-def test_the_level_does_not_count() -> None:
+def test_shapes_do_not_depend_on_the_level() -> None:
     shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
     louder = replace(window, correlation=9.0 * window.correlation)
     assert [one.z for one in shape.judge(louder)] == pytest.approx([one.z for one in shape.judge(window)])
 
 
-def test_what_cannot_be_compared_says_why_and_is_neither_changed_nor_healthy() -> None:
+def test_a_channel_that_cannot_be_compared_is_not_evaluable_with_a_reason() -> None:
     shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
     still = replace(window, correlation=0 * window.correlation)
     cases = {
@@ -116,7 +116,7 @@ def test_what_cannot_be_compared_says_why_and_is_neither_changed_nor_healthy() -
         shape.judge(window, 0)
 
 
-def test_too_little_to_learn_from_is_refused() -> None:
+def test_learning_from_too_little_data_is_refused() -> None:
     windows = recorded(1, 6)
     with pytest.raises(EstimationError, match=r"^3 healthy windows: 4 .* six or more are advised"):
         learn_shape(windows[:3])
@@ -128,7 +128,7 @@ def test_too_little_to_learn_from_is_refused() -> None:
         learn_shape([replace(window, lags_s=window.lags_s[:1]) for window in windows])
 
 
-def test_json_gives_back_the_same_shape_to_the_last_bit_and_refuses_anything_else() -> None:
+def test_a_shape_round_trips_through_json_and_damaged_json_is_refused() -> None:
     shape = learn_shape(recorded(1, 6))
     text = shape.model_dump_json()
     again = HealthyShape.model_validate_json(text)
@@ -146,8 +146,8 @@ def test_json_gives_back_the_same_shape_to_the_last_bit_and_refuses_anything_els
 
 
 @pytest.mark.parametrize("growth", [1.5, 2.0, 3.0, 8.0])
-def test_noise_that_would_be_seen_is_seen_and_other_noise_is_not(growth: float) -> None:
-    """Noise of another colour is added to windows until a channel is so many times as loud."""
+def test_noise_is_detected_above_the_stated_growth_and_not_far_below(growth: float) -> None:
+    """White noise is added to windows until a channel is `growth` times as loud."""
     shape, others = learn_shape(recorded(1, 11)), recorded(9, 6)
     powers = shape.powers(1e-4)
     for number, name in enumerate(PROBES):
@@ -163,9 +163,9 @@ def test_noise_that_would_be_seen_is_seen_and_other_noise_is_not(growth: float) 
             assert found < len(others)
 
 
-def test_few_healthy_windows_have_no_power_and_say_how_many_would() -> None:
-    """Of a machine whose excitation varies: its windows scatter by more than their own errors."""
-    rate, measured = 3e-6, learn_shape(recorded(1, 11))  # of one alarm a month and a hop of 5 s
+def test_too_few_healthy_windows_have_no_power_and_state_how_many_suffice() -> None:
+    """If the excitation varies, windows scatter by more than their own errors."""
+    rate, measured = 3e-6, learn_shape(recorded(1, 11))  # one alarm a month at hops of 5 s
     calm, few = (replace_windows(measured, count).powers(rate) for count in (11, 5))
     assert all(few[name].growth > calm[name].growth for name in PROBES)
     spread = {"variance": 7 * measured.channels[0].variance, "freedom": 1.5}
@@ -182,7 +182,7 @@ def test_few_healthy_windows_have_no_power_and_say_how_many_would() -> None:
     assert growths[needed] <= 8 < growths[needed - 1]
 
 
-def test_vibration_that_is_white_as_it_is_shows_no_noise_whatever_was_recorded() -> None:
+def test_added_noise_never_shows_in_a_channel_that_is_already_white() -> None:
     shape = learn_shape(recorded(1, 6))
     white = [0.0] * len(shape.lags_s)
     white[0] = 1.0

@@ -1,4 +1,4 @@
-"""Probes at an angle are turned to y and z for the diagnosis, and are looked at as they are mounted everywhere else."""
+"""Probes at an angle are resolved into y and z for the diagnosis, and are taken as mounted everywhere else."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -66,7 +66,7 @@ def probe(name: str, **more: object) -> dict[str, object]:
     return {"name": name, **place, **more}
 
 
-def test_the_simulator_gives_what_a_sensor_at_an_angle_sees() -> None:
+def test_the_simulator_projects_motion_onto_sensors_at_an_angle() -> None:
     plain = np.concatenate([block.samples for block in simulated(LAB)])
     turned = np.concatenate([block.samples for block in simulated(API_670)])
     y, z = (plain[:, NAMES.index(name)] for name in ("y1", "z1"))
@@ -76,7 +76,7 @@ def test_the_simulator_gives_what_a_sensor_at_an_angle_sees() -> None:
     assert np.array_equal(plain[:, NAMES.index("y1_dot")], turned[:, NAMES.index("y1_dot")])
 
 
-def test_noise_of_a_sensor_at_an_angle_is_relative_to_what_it_sees() -> None:
+def test_noise_of_a_sensor_at_an_angle_is_relative_to_its_own_signal() -> None:
     quiet, noisy = (
         np.concatenate([block.samples for block in simulated(API_670, noise=noise)])[:, NAMES.index("y1")]
         for noise in (0.0, 0.5)
@@ -99,8 +99,8 @@ def tiny(*angles: float) -> MachineFile:
     first=st.floats(-180, 180), apart=st.floats(30, 150), sign=st.sampled_from([-1, 1]), seed=st.integers(0, 2**20),
     slope=st.sampled_from([0.0, 4.0]),
 )  # fmt: skip
-def test_turning_is_exact(first: float, apart: float, sign: int, seed: int, slope: float) -> None:
-    """Whatever the angles, at a steady speed and while it changes, every statistic is that of y and z themselves."""
+def test_resolving_angled_probes_is_exact(first: float, apart: float, sign: int, seed: int, slope: float) -> None:
+    """At any angles, and at a steady or changing speed, every statistic equals that of y and z themselves."""
     rng = np.random.default_rng(seed)
     t = np.arange(1000) / 200
     theta = 2 * np.pi * (11 * t + slope * t**2 / 20)
@@ -126,7 +126,7 @@ def test_turning_is_exact(first: float, apart: float, sign: int, seed: int, slop
 
 
 def turned_at(machine: MachineFile, sensor: int) -> int:
-    """Which column of the statistics as mounted a sensor has."""
+    """The column of a sensor in the statistics as mounted."""
     return int(np.flatnonzero(plan_for(machine).columns == sensor)[0])
 
 
@@ -146,7 +146,7 @@ def test_without_a_phase_reference_vectors_are_turned_hop_by_hop() -> None:
     assert np.abs(turned) == pytest.approx(np.abs(same), rel=0.01)
 
 
-def test_machine_files_without_angles_are_as_they_were() -> None:
+def test_machine_files_without_angles_keep_their_schema_and_statistics() -> None:
     assert plan_for(LAB).turn is None
     assert "angle_deg" not in LAB.descriptor.model_dump_json()
     assert load_machine("lab").descriptor.schema_hash == "9350127db1bf"
@@ -154,7 +154,7 @@ def test_machine_files_without_angles_are_as_they_were() -> None:
     assert window.as_mounted is window
 
 
-def test_a_descriptor_says_the_angles_and_those_of_the_planes_are_the_planes() -> None:
+def test_the_descriptor_holds_angles_and_those_along_y_and_z_need_no_turning() -> None:
     at_right_angles = mounted(LAB, {"y1": (0, 90), "y2": (360, -270)})
     assert plan_for(at_right_angles).turn is None
     assert at_right_angles.descriptor.states == LAB.descriptor.states
@@ -188,20 +188,20 @@ def test_a_descriptor_says_the_angles_and_those_of_the_planes_are_the_planes() -
         ([probe("P-X", angle_deg=float("nan")), probe("P-Y", angle_deg=135)], "angle_deg"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_turned_is_refused_in_plain_words(sensors: list[dict[str, object]], says: str) -> None:
+def test_angles_that_cannot_be_resolved_are_refused(sensors: list[dict[str, object]], says: str) -> None:
     fields = LAB.model_dump(exclude={"sensors"}) | {"sensors": sensors}
     with pytest.raises(ValidationError, match=says):
         MachineFile.model_validate(fields)
 
 
-def test_at_places_with_other_names_an_angle_is_only_told() -> None:
+def test_angles_of_sensors_at_other_places_are_not_resolved() -> None:
     casing = probe("DE-X", location="DE", quantity="velocity", unit="mm/s", angle_deg=45)
     found = MachineFile.model_validate({"site": "s", "name": "m", "rate_hz": 2000.0, "sensors": [casing]})
     assert plan_for(found).turn is None
     assert found.descriptor.states == ("@DE-X",)
 
 
-def test_a_sensor_at_fault_is_found_as_it_is_mounted() -> None:
+def test_a_faulty_sensor_at_an_angle_is_named_as_mounted() -> None:
     healthy = simulated(ALL, noise=0.02)
     reference = learn_sensor_reference([window_of(ALL, healthy)])
     assert sensor_findings(window_of(ALL, healthy), reference, ALL.sensors) == ()
@@ -220,7 +220,7 @@ def test_a_sensor_at_fault_is_found_as_it_is_mounted() -> None:
     assert (found.kind, found.states) == ("offset", ("bearing@45",))
 
 
-def test_the_shaft_that_moves_in_its_bearing_is_no_offset_of_its_probes() -> None:
+def test_a_shift_of_the_shaft_is_no_offset_of_angled_probes() -> None:
     healthy = simulated(API_670, noise=0.02)
     reference = learn_sensor_reference([window_of(API_670, healthy)])
     lifted = changed(changed(healthy, "y1", offset=400.0), "z1", offset=350.0)
@@ -239,14 +239,14 @@ def test_a_sentence_about_a_plane_names_both_probes() -> None:
     assert with_channel_names("gain of y2", sensors) == "gain of y2"
 
 
-def test_shapes_are_those_of_the_sensors() -> None:
+def test_shapes_are_learned_for_sensors_as_mounted() -> None:
     windows = [window_of(API_670, simulated(API_670, noise=0.02, seed=seed), lagged=True) for seed in (8_113, 1, 2, 3)]
     shape = learn_shape(windows)
     assert [one.channel for one in shape.channels][:2] == ["bearing@45", "disc@45"]
     assert {one.state for one in shape.judge(windows[0])} >= {"bearing@45", "bearing@135", "y1_dot"}
 
 
-def test_a_line_in_healthy_data_is_that_of_a_sensor() -> None:
+def test_a_line_in_healthy_data_is_attributed_to_the_sensor_as_mounted() -> None:
     def with_hum(block: SampleBlock) -> SampleBlock:
         samples = block.samples.copy()
         t = (block.start_ns - simulated(API_670)[0].start_ns) / 1e9 + np.arange(len(samples)) / block.rate_hz

@@ -1,4 +1,4 @@
-"""Sentences that say why something is not evaluated: what was measured is beyond the limit that stands beside it."""
+"""Reasons why something is not evaluated: the value that they quote is beyond the limit that they quote."""
 
 import re
 from dataclasses import replace
@@ -45,7 +45,7 @@ def reason_of(window: WindowStatistics) -> str:
 
 
 def mixed(window: WindowStatistics, share: float) -> WindowStatistics:
-    """One spectrum of the window is partly another one's."""
+    """The window with the spectrum of its first channel modulated over frequency."""
     spectrum = window.spectrum.copy()
     spectrum[:, 0, 0] *= 1 + share * np.cos(0.3 * np.arange(len(spectrum)))
     return replace(window, spectrum=spectrum)
@@ -74,8 +74,8 @@ def test_a_parameter_far_from_nominal_says_how_far(window: WindowStatistics) -> 
     assert_beyond(str(caught.value))
 
 
-def test_what_would_be_noise_says_how_much(window: WindowStatistics) -> None:
-    """Every motion mostly white, its displacement and velocity alike."""
+def test_a_window_of_mostly_noise_states_how_much(window: WindowStatistics) -> None:
+    """Every motion is mostly white, consistently in displacement and velocity."""
     w, states = 2 * np.pi * window.frequencies_hz, list(window.states)
     spectrum = 0.01 * window.spectrum
     for at, name in enumerate(states):
@@ -93,13 +93,13 @@ def test_what_would_be_noise_says_how_much(window: WindowStatistics) -> None:
 
 
 def test_a_rotor_in_noisy_sensors_is_read(window: WindowStatistics) -> None:
-    """Three times as much noise as motion, but each sensor's own."""
+    """Three times as much noise as motion, but independent in each sensor."""
     noise = 3 * np.einsum("fii->i", window.spectrum).real / len(window.spectrum)
     assert reason_of(replace(window, spectrum=window.spectrum + np.diag(noise))) == ""
 
 
-def test_beside_a_misfit_the_rotor_must_be_seen(window: WindowStatistics) -> None:
-    """Sensors hear ten times their motion, each for itself, and in a part of the band more of it."""
+def test_a_misfit_without_visible_rotor_motion_is_unexplained(window: WindowStatistics) -> None:
+    """Each sensor has independent noise of ten times its motion, and more of it in a part of the band."""
     noise = 100 * np.diag(np.einsum("fii->i", window.spectrum).real / len(window.spectrum))
     more = np.where(np.abs(window.frequencies_hz - 70) < 5, 3.0, 1.0)[:, None, None]
     gain = np.where(np.arange(len(window.states)) == 0, 1.1, 1.0)
@@ -113,14 +113,14 @@ def test_beside_a_misfit_the_rotor_must_be_seen(window: WindowStatistics) -> Non
     assert_beyond(reason_of(replace(window, spectrum=window.spectrum + noise * more)))
 
 
-def test_a_vague_reading_says_how_vague(window: WindowStatistics) -> None:
+def test_an_imprecise_reading_states_its_error(window: WindowStatistics) -> None:
     for error in (0.2001, 0.204, 0.5, 3.0):
         vague = Diagnosis("likelihood", (parameter_reading("k_by", "likelihood", 0.1, error),))
         assert_beyond(determined(vague, window, 60.0).parameters[0].reason)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.948, 1.052, 2.0])
-def test_a_speed_out_of_range_says_so_in_numbers(window: WindowStatistics, factor: float) -> None:
+def test_a_speed_out_of_range_is_stated_with_its_limit(window: WindowStatistics, factor: float) -> None:
     tolerance = MACHINE.operation.speed_tolerance
     off = replace(window, speed_rad_s=MACHINE.operation.speed_rad_s * (1 + (factor - 1) * max(1.0, tolerance / 0.05)))
     with pytest.raises(EstimationError) as caught:
@@ -128,7 +128,7 @@ def test_a_speed_out_of_range_says_so_in_numbers(window: WindowStatistics, facto
     assert_beyond(str(caught.value))
 
 
-def test_an_unsteady_speed_says_so_in_numbers(window: WindowStatistics) -> None:
+def test_an_unsteady_speed_is_stated_with_its_limit(window: WindowStatistics) -> None:
     nominal = MACHINE.operation.speed_rad_s
     for part in (0.1501, 0.2, 0.6):
         swept = replace(window, speed_range=(nominal * (1 - part / 2), nominal * (1 + part / 2)))
@@ -137,7 +137,7 @@ def test_an_unsteady_speed_says_so_in_numbers(window: WindowStatistics) -> None:
         assert_beyond(str(caught.value))
 
 
-def test_networks_say_what_they_do_not_know(window: WindowStatistics) -> None:
+def test_networks_give_one_reason_with_its_limit_for_an_unknown_window(window: WindowStatistics) -> None:
     networks = sure(load_bundle("lab", MACHINE).amortised)
     diagnostician = NetworkDiagnostician(MACHINE, networks)
     spectrum = window.spectrum.copy()
@@ -148,15 +148,15 @@ def test_networks_say_what_they_do_not_know(window: WindowStatistics) -> None:
 
 
 @pytest.mark.parametrize("change", [-1.0, -1.004, -4.7])
-def test_what_physics_does_not_allow_is_no_reading(change: float) -> None:
+def test_physically_impossible_changes_are_no_reading(change: float) -> None:
     for name in ("k_by", "e"):
         reading = possible_reading(name, "relation", change, 0.1)
         assert reading.relative_change is None
         assert reading.reason == impossible(change, "distance" if name == "e" else "stiffness")
 
 
-def test_a_suspect_that_cannot_be_is_none() -> None:
-    """Nor is one named whose one-step size only says that it is not small; the name may stand then."""
+def test_physically_impossible_suspects_are_not_named() -> None:
+    """A one-step size that only shows that the change is not small is left out; the name may remain."""
 
     def suspect(name: str, change: float, z: float = 20.0) -> str:
         return Goodness(9.0, (AlternativeTest(name, z, change), AlternativeTest("gain of y1", 6.0, 0.1)), 2).suspect
@@ -165,14 +165,14 @@ def test_a_suspect_that_cannot_be_is_none() -> None:
     assert suspect("inertia of the disc", 4.96) == "inertia of the disc"
     assert suspect("mass of the disc", 0.07) == "mass of the disc (+7.0%)"
     assert suspect("shaft stiffer in y than in z", 1.2) == ""
-    assert suspect("shaft stiffer in y than in z", -0.0003) == ""  # as true as that no machine is built
+    assert suspect("shaft stiffer in y than in z", -0.0003) == ""  # no machine is built that exactly
     assert suspect("mass of the disc", 0.07, z=4.0) == "gain of y1 (+10.0%)"
     assert suspect("delay of y1", -4e-5) == "delay of y1 (-40 µs)"
     assert suspect("delay of y1", 1e-6) == ""
     assert suspect("delay of y1", 2e-3) == "delay of y1"
 
 
-def test_what_accounts_for_some_of_a_window_is_told_and_of_an_unexplained_one_what_accounts_for_much() -> None:
+def test_suspects_must_explain_part_of_the_misfit_and_more_if_unexplained() -> None:
     delay = AlternativeTest("delay of y1", 20.0, 4e-5)
     mostly, partly, hardly = (Goodness(9.0, (delay,), 2, excess) for excess in (1000.0, 2000.0, 5000.0))
     assert mostly.suspected(unexplained=True) == "delay of y1 (+40 µs)"

@@ -1,4 +1,4 @@
-"""What is broken on purpose and mended; what that may cost, and what has to be said, stands in docs/reliability.md."""
+"""Faults caused on purpose and repaired; docs/reliability.md states what each may cost and what must be reported."""
 
 import os
 import resource
@@ -35,10 +35,10 @@ def publisher_killed(plant: Plant) -> None:
     plant.stated(_silent, "stream lost")
     plant.publish(run=2)
     plant.over()
-    plant.away_s = 60.0  # nobody measured meanwhile
+    plant.away_s = 60.0  # no data in the meantime
 
 
-def publisher_stands(plant: Plant) -> None:
+def publisher_paused(plant: Plant) -> None:
     publisher = plant.at_work()
     pause(publisher)
     plant.broken()
@@ -92,7 +92,7 @@ def clock_set(offset_s: float) -> Callable[[Plant], None]:
             finally:
                 stop.set()
                 publisher.join()
-        plant.away_s = 10 * _FED_S  # until the clock is believed
+        plant.away_s = 10 * _FED_S  # until the clock is accepted
 
     return run
 
@@ -148,7 +148,7 @@ def monitor_stopped(plant: Plant) -> None:
     start_again(plant)
 
 
-def monitor_stands(plant: Plant) -> None:
+def monitor_paused(plant: Plant) -> None:
     plant.publish()
     plant.flowing()
     pause(plant.running)
@@ -257,7 +257,7 @@ def replaced(plant: Plant) -> None:
 
 
 def _goes_on(seen: Seen) -> bool:
-    """Monitored and written; that something is gone is said until the monitor is started again."""
+    """Data are monitored and written; the loss is reported until the monitor is restarted."""
     return seen.flowing and not seen.readiness.history_trouble
 
 
@@ -284,7 +284,7 @@ def damaged_at_start(plant: Plant) -> None:
     plant.under_orders()
     assert plant.end(signal.SIGTERM) == 0
     with sqlite3.connect(plant.history) as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # what is overwritten holds everything
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # then the overwritten file holds everything
     connection.close()
     _overwrite(plant.history, _PAGE)
     plant.broken()
@@ -357,7 +357,7 @@ def flood(plant: Plant) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One fault: its name in the page, what breaks and mends it, and what comes before the monitor is started."""
+    """One fault: its name on the page, what causes and repairs it, and what precedes the start of the monitor."""
 
     name: str
     run: Callable[[Plant], None]
@@ -366,7 +366,7 @@ class Row:
 
 ROWS = (
     Row("The publisher is killed and restarted", publisher_killed),
-    Row("The publisher is paused", publisher_stands),
+    Row("The publisher is paused", publisher_paused),
     Row("The publisher is restarted an hour later by its clock", restarted_at(3600.0)),
     Row("The publisher is restarted an hour earlier by its clock", restarted_at(-3600.0)),
     Row("The publisher's clock is set forward", clock_set(3600.0)),
@@ -375,7 +375,7 @@ ROWS = (
     Row("The network link is cut", link_cut, through_router),
     Row("The monitor is killed, three times", monitor_killed),
     Row("The monitor is shut down cleanly", monitor_stopped),
-    Row("The monitor is paused", monitor_stands),
+    Row("The monitor is paused", monitor_paused),
     Row("A second monitor is started with the same machine and history", second_monitor),
     Row("The history is locked by another program", history_locked),
     Row("The history stays locked until the monitor has stopped", locked_to_the_end),

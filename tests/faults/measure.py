@@ -1,4 +1,4 @@
-"""Carries out a row with one seed, says what it cost and what did not hold, and writes that into its page."""
+"""Carries out a row with one seed, measures its cost, checks what must hold, and writes both into the page."""
 
 import re
 import tempfile
@@ -42,7 +42,7 @@ def carried_out(row: Row, seed: int) -> Outcome:
 def _outcome(at: Plant) -> Outcome:
     at.rest_from_work()
     unaccounted = at.unaccounted()
-    heard = list(at.heard)  # before the log is read, in which they have been for long
+    heard = list(at.heard)  # before the log is read, which holds them earlier
     log = at.log()
     at.note()
     lost = [one for one in at.answered if one not in log]
@@ -80,7 +80,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> str:
 
 
 def written(page: str, found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int], loads: Sequence[float]) -> str:
-    """The page with the outcomes of every row, by its name, and load averages of the computer in the course of it."""
+    """The page with the outcomes of every row, by its name, and the load averages during the run."""
     outcomes = [one for each in found.values() for one in each]
     compared = [one.unaccounted for one in outcomes if one.unaccounted is not None]
     wrong = "".join(

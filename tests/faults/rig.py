@@ -1,7 +1,7 @@
-"""A monitor, a publisher and an operator at work, and what is measured of them while something is broken on purpose.
+"""A monitor, a publisher and an operator at work, and measurements of them while faults are caused on purpose.
 
-The monitor and the publisher are the programs as users start them. The operator shelves an alarm and ends that again,
-all the time, and remembers what was answered as done. A witness on the network remembers every alarm event it hears.
+The monitor and the publisher are the programs as users start them. The operator keeps shelving and unshelving an
+alarm, and records confirmed orders. A witness on the network records every alarm event that it receives.
 """
 
 import os
@@ -42,7 +42,7 @@ Event = tuple[str, str, str, int]
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a monitor said of itself at one moment."""
+    """The state that a monitor reported at one moment."""
 
     ready: bool
     readiness: Readiness
@@ -62,7 +62,7 @@ class Seen:
 
     @property
     def well(self) -> bool:
-        """Whether data come in and nothing is wrong with service or stream; a gap stands while the window holds it."""
+        """Whether data arrive and nothing is wrong with service or stream; a gap counts while the window holds it."""
         calm = {HealthState.WARMING, HealthState.HEALTHY}
         return self.ready and self.flowing and self.health.state in calm and not self.raised(STREAM_LOST)
 
@@ -97,7 +97,7 @@ class Plant:
 
     @property
     def history(self) -> Path:
-        """The database's file, as this process reaches it."""
+        """The database file, as this process reaches it."""
         if self.disk:
             return Path(f"/proc/{self.running.process.pid}/root").joinpath(
                 *self.folder.parts[1:], "history", "h.sqlite"
@@ -108,7 +108,7 @@ class Plant:
     def running(self) -> Program:
         return sure(self.monitor)
 
-    # What runs
+    # Programs
 
     def start(self) -> Program:
         self.monitor = None
@@ -149,13 +149,13 @@ class Plant:
         self.router.wait_for("router listening")
 
     def end(self, number: signal.Signals = signal.SIGKILL) -> int:
-        """End the monitor, having looked at what it counted; returns its exit code."""
+        """End the monitor after noting its counts; return its exit code."""
         self.note()
         ended, self.monitor = self.running, None
         ended.process.send_signal(number)
         return ended.process.wait(_LONGEST_S)
 
-    # What is seen
+    # Observations
 
     def look(self) -> Seen | None:
         if self.monitor is None or self.monitor.process.poll() is not None:
@@ -183,24 +183,24 @@ class Plant:
         self.wait(lambda s: s.flowing and s.health.quality.accepted_blocks >= blocks, "data")
 
     def at_work(self, *options: str) -> Program:
-        """Publish, and go on for a moment once data have come in."""
+        """Publish, wait for data, and carry on for a moment."""
         publisher = self.publish(*options)
         self.flowing()
         self.rest(0.5, 2.0)
         return publisher
 
     def under_orders(self) -> None:
-        """Publish, and wait until operators have been answered once data have come in."""
+        """Publish, wait for data, and then for confirmed orders."""
         self.publish()
         self.flowing()
         self.wait_for_orders()
 
     def rest(self, from_s: float, to_s: float) -> None:
-        """Let some time pass, another one with each seed."""
+        """Let a time pass that depends on the seed."""
         time.sleep(self.rng.uniform(from_s, to_s))
 
     def note(self) -> None:
-        """Add up what the monitor that runs has counted."""
+        """Add the counts of the running monitor."""
         self.look()
         if self._last is not None and self.monitor is not None:
             self.missing_s += self._last.quality.missing_s
@@ -208,7 +208,7 @@ class Plant:
             self._last = None
 
     def broken(self) -> None:
-        """Something was broken just now; what is stated, is stated so many seconds after this."""
+        """Begin timing: the fault was caused just now."""
         self._begin_s = time.monotonic()
 
     mended = broken
@@ -218,7 +218,7 @@ class Plant:
         self.stated_now()
 
     def stated_now(self) -> None:
-        """It was said in another way."""
+        """Record that the fault has been stated just now."""
         self.stated_s.append(time.monotonic() - self._begin_s)
 
     def recovered(self, condition: Callable[[Seen], bool] = lambda seen: seen.well) -> None:
@@ -226,11 +226,11 @@ class Plant:
         self.recovered_s.append(time.monotonic() - self._begin_s)
 
     def over(self, condition: Callable[[Seen], bool] = lambda seen: seen.well) -> None:
-        """It was mended just now; wait until everything is as it should be."""
+        """The fault was repaired just now: wait for recovery."""
         self.mended()
         self.recovered(condition)
 
-    # What came of it
+    # Results
 
     def log(self) -> list[Event]:
         """Every alarm event that is in the monitor's log."""
@@ -247,7 +247,7 @@ class Plant:
                 after = events[-1].data.sequence
 
     def _operate(self) -> None:
-        """Shelve an alarm and end that, again and again, and remember what was answered as done."""
+        """Shelve and unshelve an alarm repeatedly, and record what was confirmed."""
         action = "shelve"
         while not self._over.wait(0.3):
             at = self.monitor
@@ -276,7 +276,7 @@ class Plant:
             one.join()
 
     def unaccounted(self) -> int | None:
-        """Blocks that were published and neither evaluated nor stated as missing; None if nobody can tell."""
+        """Blocks that were published and neither evaluated nor stated as missing; None if unknown."""
         if self._lives != 1 or len(self.publishers) != 1:
             return None
         assert self.publishers[0].stop() == 0

@@ -1,4 +1,4 @@
-"""A row of the table of faults, so that none of it rots; ``python -m tests.faults`` carries out all of them."""
+"""One row of the table of faults as a regression test; ``python -m tests.faults`` carries out all of them."""
 
 import re
 

@@ -30,7 +30,7 @@ TEXT = TIME + CHANNELS
 HEADER = "t,x,v,a"
 SAMPLED = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
 PULSES = SAMPLED + CHANNELS.replace("theta =", "# theta =") + "[keyphasor]\n"
-"""Of a file that has pulses in place of an angle."""
+"""Mapping of a file with pulses in place of an angle."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ def archive(folder: Path, **columns: object) -> Path:
 
 
 def summary(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> str:
-    """What is told of an import."""
+    """The summary of an import."""
     return "\n".join(summary_lines(imported(folder, source, mapping, described)[0]))
 
 
 def stretches(recording: Path, described: MachineFile | None = None) -> list[Stretch]:
-    """What a monitor makes of a recording: nothing may be refused, and gaps are where its gate sees them."""
+    """Stretches of a recording as a monitor sees them: no block may be refused; its gate decides on gaps."""
     described = described or machine()
     gate = Gate(described)
     found: list[tuple[int, list[FloatArray]]] = []
@@ -101,7 +101,7 @@ GOOD = good_rows()
 
 
 def with_cell(cell: str) -> list[str]:
-    """Good rows, but for one cell of the velocity."""
+    """Good rows, except for one cell of the velocity."""
     t, x, _, a = GOOD[736].split(",")
     return [*GOOD[:736], f"{t},{x},{cell},{a}", *GOOD[737:]]
 

@@ -1,4 +1,4 @@
-"""What is exported is read by the other program's library with units and times, and can be imported again."""
+"""Exports are read by each format's own library with units and times, and can be imported again."""
 
 import csv
 import json
@@ -74,12 +74,12 @@ SI = {"um": "m", "mm/s": "m/s", "rad": "rad"}
 
 
 @pytest.mark.parametrize(("kind", "si"), [("parquet", False), ("csv", True), ("mat", False)])
-def test_exported_files_are_read_by_others_and_come_back_same(tmp_path: Path, kind: ExportFormat, si: bool) -> None:
+def test_exports_open_in_other_libraries_and_import_unchanged(tmp_path: Path, kind: ExportFormat, si: bool) -> None:
     samples = recording(tmp_path / "run.mcap")
     out = tmp_path / f"run.{kind}"
     table = export(Selection((tmp_path / "run.mcap",), si=si), "stream", kind, out)
     assert table.rows == samples.shape[0]
-    assert len(table.skipped) == 2  # the repeated block and the one that is none
+    assert len(table.skipped) == 2  # the repeated block and the invalid one
     units = {channel.name: SI[channel.unit] if si else channel.unit for channel in LAB.sensors}
     factors = np.array([channel.to_si if si else 1.0 for channel in LAB.sensors])
     expected = samples * factors
@@ -120,7 +120,7 @@ def test_exported_files_are_read_by_others_and_come_back_same(tmp_path: Path, ki
     assert len(done.read.gaps) == 1
 
 
-def test_a_part_is_cut_to_the_sample_and_recordings_are_joined_in_time(tmp_path: Path) -> None:
+def test_a_selected_part_is_cut_to_the_sample(tmp_path: Path) -> None:
     whole = recording(tmp_path / "b.mcap")
     selection = Selection(
         (tmp_path / "b.mcap",), from_ns=START_NS + 1001 * STEP_NS - 7, to_ns=START_NS + 1700 * STEP_NS
@@ -131,11 +131,11 @@ def test_a_part_is_cut_to_the_sample_and_recordings_are_joined_in_time(tmp_path:
     np.testing.assert_array_equal(read.column("y1").to_numpy(), whole[1001:1700, 0].astype(np.float32))
 
 
-def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
+def test_reports_and_alarms_are_exported_as_tables(tmp_path: Path) -> None:
     recording(tmp_path / "run.mcap", blocks=2)
     selection = Selection((tmp_path / "run.mcap",), to_ns=START_NS + 6_000_000_000)
     table = export(selection, "reports", "parquet", tmp_path / "reports.parquet")
-    assert len(table.skipped) == 1  # the half message
+    assert len(table.skipped) == 1  # the truncated message
     read = pa.parquet.read_table(tmp_path / "reports.parquet")
     assert read.column("end_ns").to_pylist() == [START_NS, START_NS + 5_000_000_000]
     report = Report.model_validate(example(Report))
@@ -162,7 +162,7 @@ def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
     assert np.isnan(content["e_relative_change"]["samples"]).all()
 
 
-def test_channels_that_change_on_the_way_are_refused(tmp_path: Path) -> None:
+def test_channels_that_change_between_recordings_are_refused(tmp_path: Path) -> None:
     recording(tmp_path / "a.mcap", blocks=2)
     sensors = [channel.model_dump() for channel in LAB.sensors]
     sensors[0]["unit"] = "mil"
@@ -184,7 +184,7 @@ def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
     assert export(Selection(both, machine="demo/heavy"), "stream", "csv", tmp_path / "out.csv").rows == 600
 
 
-def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> None:
+def test_missing_data_and_unusable_output_files_are_named(tmp_path: Path) -> None:
     recording(tmp_path / "run.mcap", blocks=2)
     selection = Selection((tmp_path / "run.mcap",), from_ns=START_NS + 10**12)
     with pytest.raises(RecordingError, match="no stream in the time that is wanted"):

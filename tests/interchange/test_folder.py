@@ -1,4 +1,4 @@
-"""A folder of snapshot files comes in as one recording, in the order of the files' times."""
+"""A folder of snapshot files is imported as one recording, in the order of the files' times."""
 
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
@@ -72,7 +72,7 @@ def begun(recording: Path) -> list[int]:
 
 
 @pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
-def test_snapshots_come_in_with_their_times_and_all(tmp_path: Path, name: Callable[[int], str], mapping: str) -> None:
+def test_all_snapshots_are_imported_with_their_times(tmp_path: Path, name: Callable[[int], str], mapping: str) -> None:
     done, recording = imported(tmp_path, write(tmp_path / "files", name), mapping, KIT)
     found = stretches(recording, KIT)
     assert [one.start_ns for one in found] == times(range(FILES))
@@ -116,7 +116,7 @@ def test_files_are_joined_in_the_order_of_their_times_or_else_of_their_numbers(
 
 
 @pytest.mark.parametrize("dated", [True, False])
-def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file(tmp_path: Path, dated: bool) -> None:
+def test_the_time_in_a_waveform_overrides_that_in_the_file_name(tmp_path: Path, dated: bool) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
     for number in range(3):  # names in local time, an hour ahead
@@ -135,7 +135,7 @@ def test_the_time_in_a_waveform_counts_more_than_the_one_in_the_name_of_its_file
 @pytest.mark.parametrize(
     ("name", "mapping"), [(by_date, NAMED), *((name, NUMBERED) for name in (by_number, by_tens, by_clock, by_day))]
 )
-def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
+def test_a_missing_snapshot_is_reported_and_the_others_keep_their_times(
     tmp_path: Path, name: Callable[[int], str], mapping: str
 ) -> None:
     folder = write(tmp_path / "files", name)
@@ -148,7 +148,7 @@ def test_a_snapshot_that_is_missing_is_told_and_the_others_keep_their_times(
 
 
 @pytest.mark.parametrize(("rate_hz", "short"), [(RATE_HZ, False), (1000.0, True)])
-def test_snapshots_that_filters_leave_too_short_are_told(tmp_path: Path, rate_hz: float, short: bool) -> None:
+def test_snapshots_that_filters_leave_too_short_are_reported(tmp_path: Path, rate_hz: float, short: bool) -> None:
     kit = machine(schedule={"on_s": ON_S, "every_s": EVERY_S}, window={}, ingest={}, rate_hz=rate_hz)
     mapping = NAMED.replace("rate_hz", "resample = true\nrate_hz")
     told = summary(tmp_path, write(tmp_path / "files", by_date), mapping, kit)
@@ -159,7 +159,7 @@ def test_snapshots_that_filters_leave_too_short_are_told(tmp_path: Path, rate_hz
 
 @pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
 @pytest.mark.parametrize("number", [0, 5])
-def test_a_file_that_cannot_be_read_is_named_and_the_others_come_in_at_their_times(
+def test_an_unreadable_file_is_named_and_the_others_keep_their_times(
     tmp_path: Path, name: Callable[[int], str], mapping: str, number: int
 ) -> None:
     folder = write(tmp_path / "files", name)
@@ -176,7 +176,7 @@ def test_a_file_that_cannot_be_read_is_named_and_the_others_come_in_at_their_tim
 
 
 @pytest.mark.parametrize(("zone", "ahead_h"), [("Europe/Berlin", 1.0), ("+05:30", 5.5), ("UTC", 0.0), (None, 0.0)])
-def test_times_in_names_are_of_the_zone_that_the_mapping_names(
+def test_times_in_file_names_are_in_the_time_zone_of_the_mapping(
     tmp_path: Path, zone: str | None, ahead_h: float
 ) -> None:
     mapping = NAMED if zone is None else NAMED.replace("rate_hz", f'zone = "{zone}"\nrate_hz')
@@ -186,7 +186,7 @@ def test_times_in_names_are_of_the_zone_that_the_mapping_names(
     assert (zone or "UTC (if they are local time, say time.zone in the mapping)") in told
 
 
-def test_a_serial_number_is_no_time(tmp_path: Path) -> None:
+def test_a_serial_number_in_a_file_name_is_no_time(tmp_path: Path) -> None:
     def since_1970(number: int) -> str:
         return f"SN1402155779_{START_NS // 10**9 + round(number * EVERY_S)}.npz"
 
@@ -198,7 +198,7 @@ def test_a_serial_number_is_no_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [by_date, by_number])
 @pytest.mark.parametrize("runs_on", [True, False])
-def test_a_time_column_that_runs_on_from_file_to_file_counts_once(
+def test_time_columns_may_run_on_across_files_or_start_anew(
     tmp_path: Path, name: Callable[[int], str], runs_on: bool
 ) -> None:
     folder = write(tmp_path / "files", name)
@@ -224,7 +224,7 @@ def test_a_start_alone_is_enough_where_the_time_column_runs_on(tmp_path: Path) -
     np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
 
 
-def test_files_of_different_lengths_are_told(tmp_path: Path) -> None:
+def test_different_file_lengths_are_reported(tmp_path: Path) -> None:
     folder = write(tmp_path / "files", by_date, range(3))
     told = summary(tmp_path, folder, NAMED)
     assert f"files: 3 files, {3 * COUNT} rows" in told
@@ -235,7 +235,7 @@ def test_files_of_different_lengths_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", ["rate_hz = 2000.0", 'column = "t"\nunit = "ns"'])
-def test_where_names_have_times_a_start_that_is_too_much_is_told(tmp_path: Path, rate: str) -> None:
+def test_a_start_in_addition_to_times_in_file_names_is_refused(tmp_path: Path, rate: str) -> None:
     folder = write(tmp_path / "files", by_date, range(3))
     for number in range(3):
         arrays = dict(np.load(folder / by_date(number)))
@@ -257,13 +257,13 @@ def test_where_names_have_times_a_start_that_is_too_much_is_told(tmp_path: Path,
         (f'format = "tdms"\n{NAMED}', EVERY_S, "damaged, or no TDMS file"),
     ],
 )
-def test_what_is_wrong_with_a_folder_is_told(tmp_path: Path, mapping: str, every_s: float, says: str) -> None:
+def test_mistakes_in_a_folder_are_named(tmp_path: Path, mapping: str, every_s: float, says: str) -> None:
     folder = write(tmp_path / "files", by_number, range(3), every_s)
     with pytest.raises(SourceError, match=says):
         imported(tmp_path, folder, mapping, KIT)
 
 
-def test_a_start_alone_needs_a_schedule_and_nothing_but_files_that_count(tmp_path: Path) -> None:
+def test_a_start_alone_needs_a_schedule_and_only_numbered_files(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"time\.start is that of the first file; expected \[schedule\] every_s"):
         imported(tmp_path, write(tmp_path / "files", by_number, range(3)), NUMBERED)
     (tmp_path / "empty").mkdir()

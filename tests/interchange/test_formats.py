@@ -1,4 +1,4 @@
-"""Files written by each format's own library come in with their samples and times."""
+"""Files written by each format's own library are imported with their samples and times."""
 
 import csv
 import gc
@@ -77,18 +77,18 @@ def write_mat(path: Path, columns: Columns) -> None:
 
 
 def write_mat_of_structs(path: Path, columns: Columns) -> None:
-    """As public data sets of bearings have it: Y(2).Data; and cells."""
+    """Structs such as Y(2).Data, as in public bearing data sets, and cells."""
     several = np.zeros((1, 2), dtype=[("Name", "O"), ("Data", "O")])
     for number, name in enumerate("xv"):
         several[0, number] = (name, columns[name])
     cells = np.empty((1, 2), dtype=object)
     cells[0, :] = ["angle", {"a": columns["a"]}]
-    sparse = scipy.sparse.eye_array(3)  # which nothing is read of
+    sparse = scipy.sparse.eye_array(3)  # which is not read
     savemat(path, {"run": {"Info": "bearing 3", "Y": several}, "more": cells, "fs": RATE_HZ, "sparse": sparse})
 
 
 def write_mat73_of_structs(path: Path, columns: Columns) -> None:
-    """The same as MATLAB stores it in HDF5: references to what is in a group of its own."""
+    """The same as MATLAB stores it in HDF5: as references into a separate group."""
     with h5py.File(path, "w") as file:
         stored = file.create_group("#refs#")
         for name in "xv":
@@ -194,7 +194,7 @@ CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_file_of_the_formats_own_library_comes_in_unchanged(case: str, tmp_path: Path) -> None:
+def test_a_file_written_by_the_formats_own_library_is_imported_unchanged(case: str, tmp_path: Path) -> None:
     name, write, mapping = CASES[case]
     time, x, v, angle = signals(COUNT)
     write(tmp_path / name, {"t": time, "x": x, "v": v, "a": angle})
@@ -210,7 +210,7 @@ def test_a_file_of_the_formats_own_library_comes_in_unchanged(case: str, tmp_pat
 @pytest.mark.parametrize(
     ("dtype", "largest"), [(np.int16, 2.0**15), (np.int32, 2.0**31), (np.uint8, 2.0**7), (np.float32, 1.0)]
 )
-def test_integers_of_a_wav_file_are_of_full_scale(tmp_path: Path, dtype: type[np.generic], largest: float) -> None:
+def test_wav_integers_are_fractions_of_full_scale(tmp_path: Path, dtype: type[np.generic], largest: float) -> None:
     fraction = np.sin(np.arange(4000) * 0.07) * 0.9
     offset = 128 if dtype is np.uint8 else 0
     whole = np.rint(fraction * largest) if largest > 1 else fraction
@@ -222,7 +222,7 @@ def test_integers_of_a_wav_file_are_of_full_scale(tmp_path: Path, dtype: type[np
 
 
 @pytest.mark.parametrize(("of", "zone", "late_h"), [("Europe/Berlin", "", 0), (None, "America/New_York", 5)])
-def test_dates_in_a_parquet_file_are_the_times_in_their_zone_or_that_of_the_mapping(
+def test_dates_in_a_parquet_file_have_their_own_time_zone_or_the_mappings(
     tmp_path: Path, of: str | None, zone: str, late_h: int
 ) -> None:
     _, x, v, angle = signals(3000)
@@ -237,7 +237,7 @@ def test_dates_in_a_parquet_file_are_the_times_in_their_zone_or_that_of_the_mapp
 @pytest.mark.parametrize(
     "written", ["dates", "bare dates", "mixed dates", "local dates", "nanoseconds", "milliseconds"]
 )
-def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: str) -> None:
+def test_columns_of_a_text_table_without_names_are_numbered(tmp_path: Path, written: str) -> None:
     _, x, v, angle = signals(3000)
     with (tmp_path / "run.csv").open("w", encoding="utf-8") as file:
         for row in range(3000):
@@ -293,7 +293,7 @@ def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
     ],
     ids=["cut off", "fewer samples than its header says"],
 )  # fmt: skip
-def test_a_data_set_that_is_not_whole_is_told(tmp_path: Path, spoil: Callable[[bytes], bytes], said: str) -> None:
+def test_a_truncated_data_set_is_named(tmp_path: Path, spoil: Callable[[bytes], bytes], said: str) -> None:
     t, x, v, a = signals(1000)
     write_uff(tmp_path / "run.uff", {"t": t, "x": x, "v": v, "a": a})
     whole = (tmp_path / "run.uff").read_bytes()
@@ -304,7 +304,7 @@ def test_a_data_set_that_is_not_whole_is_told(tmp_path: Path, spoil: Callable[[b
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"])
-def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -> None:
+def test_a_file_that_is_not_of_its_format_is_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"broken.{suffix}"
     path.write_bytes(b"\x00\xff\x13 this is not it" * 30)
     with pytest.raises(SourceError, match=r"broken\."):
@@ -313,17 +313,17 @@ def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
-def test_a_measurement_that_is_cut_off_is_named_without_the_complaint_of_a_library(tmp_path: Path) -> None:
+def test_a_truncated_measurement_is_named_without_library_warnings(tmp_path: Path) -> None:
     t, x, v, a = signals(1000)
     path = tmp_path / "run.mf4"
     write_mf4(path, {"t": t, "x": x, "v": v, "a": a})
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(SourceError, match=r"run\.mf4: damaged, or no MF4 file: .*"):
         imported(tmp_path, path, CHANNELS)
-    gc.collect()  # what is not closed complains then
+    gc.collect()  # unclosed files would warn now
 
 
-def test_an_unknown_format_says_which_ones_there_are(tmp_path: Path) -> None:
+def test_the_error_for_an_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "run.xyz").write_text("1,2")
     with pytest.raises(SourceError, match=r"'\.xyz' is not known.*\.tdms"):
         imported(tmp_path, tmp_path / "run.xyz", SAMPLED + CHANNELS)

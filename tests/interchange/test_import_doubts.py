@@ -1,4 +1,4 @@
-"""What looks wrong in a file, though it can be read, is told: units, dates, turns, cells without a number."""
+"""Doubtful contents of a readable file are reported: units, dates, turns, cells without a number."""
 
 import re
 import wave
@@ -29,7 +29,7 @@ from tests.interchange.material import (
 from tests.sure import sure
 
 
-def test_numbers_where_dates_are_told_are_named(tmp_path: Path) -> None:
+def test_numbers_in_place_of_dates_are_named(tmp_path: Path) -> None:
     time, x, v, a = signals(1000)
     source = archive(tmp_path, t=time + 3.0, x=x, v=v, a=a)
     mapping = f'[time]\ncolumn = "t"\nunit = "datetime"\n{CHANNELS}'
@@ -37,7 +37,7 @@ def test_numbers_where_dates_are_told_are_named(tmp_path: Path) -> None:
         imported(tmp_path, source, mapping)
 
 
-def test_channels_of_a_tdms_file_that_differ_in_time_are_told_in_words(tmp_path: Path) -> None:
+def test_tdms_channels_with_differing_times_are_named(tmp_path: Path) -> None:
     columns = dict(zip("xva", signals(1000)[1:], strict=True))
     told = {"wf_increment": 1 / 2000, "wf_start_time": np.datetime64("2026-01-31T12:00:00")}
     with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
@@ -75,7 +75,7 @@ def test_texts_for_missing_numbers_count_as_empty_cells(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("unit", "says"), [("rad", "shaft angle: 1320 rpm on average"), ("deg", "shaft angle: 23.0383 rpm on average")]
 )
-def test_the_speed_of_a_column_of_angles_is_told(tmp_path: Path, unit: str, says: str) -> None:
+def test_the_mean_speed_of_an_angle_column_is_reported(tmp_path: Path, unit: str, says: str) -> None:
     mapping = TEXT.replace('column = "a", unit = "rad"', f'column = "a", unit = "{unit}"')
     time, x, v, _ = signals(1000)
     rows = zip(time, x, v, 2 * np.pi * 22.0 * time, strict=True)
@@ -86,7 +86,7 @@ def test_the_speed_of_a_column_of_angles_is_told(tmp_path: Path, unit: str, says
 
 
 @pytest.mark.parametrize(("marks", "doubted"), [(16, False), (60, True)])
-def test_pulses_that_come_faster_than_the_samples_tell_are_doubted(tmp_path: Path, marks: int, doubted: bool) -> None:
+def test_pulses_too_fast_for_the_sampling_rate_are_doubted(tmp_path: Path, marks: int, doubted: bool) -> None:
     time, x, v, _ = signals(4000)
     source = archive(tmp_path, x=x, v=v, k=np.mod(22.0 * marks * time, 1.0) < 0.5)
     mapping = f'{PULSES}column = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
@@ -128,7 +128,7 @@ def test_a_unit_in_round_brackets_may_be_left_out_of_the_mapping(tmp_path: Path)
     np.testing.assert_allclose(stretches(recording)[0].samples[:, 0], signals(1000)[1] * 25.4, rtol=1e-9)
 
 
-def test_a_column_of_volts_without_a_unit_in_the_mapping_is_refused_with_what_to_give(tmp_path: Path) -> None:
+def test_a_column_of_volts_without_a_unit_in_the_mapping_is_refused_with_advice(tmp_path: Path) -> None:
     mapping = TEXT.replace('{ column = "x", unit = "um" }', '{ column = "x (V)" }')
     assert "give unit and scale in the mapping" in fault(tmp_path, GOOD, mapping, "t,x (V),v,a")
 
@@ -137,7 +137,7 @@ def test_a_column_of_volts_without_a_unit_in_the_mapping_is_refused_with_what_to
     ("header", "wish", "noted"),
     [("Volts", "", True), ("um pp", "", True), ("Volts", ", scale = 5", False), ("um", "", False)],
 )
-def test_a_unit_in_the_file_that_is_none_of_samples_is_told(
+def test_a_unit_in_the_file_that_does_not_suit_samples_is_noted(
     tmp_path: Path, header: str, wish: str, noted: bool
 ) -> None:
     source = table(tmp_path / "run.csv", GOOD, f"t,x ({header}),v,a")
@@ -147,7 +147,7 @@ def test_a_unit_in_the_file_that_is_none_of_samples_is_told(
     assert (says in told) == noted
 
 
-def test_whole_numbers_of_a_wav_file_without_a_scale_are_told(tmp_path: Path) -> None:
+def test_integers_of_a_wav_file_without_a_scale_are_noted(tmp_path: Path) -> None:
     with wave.open(str(tmp_path / "run.wav"), "wb") as file:
         file.setnchannels(3)
         file.setsampwidth(3)
@@ -187,7 +187,7 @@ def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: obj
 
 @pytest.mark.parametrize("marks", [1, 15])
 @pytest.mark.parametrize(("faster_hz", "says"), [(20.3, ", 0 missing"), (40.0, ", mostly 1200 to 2400, 0 missing")])
-def test_speeds_that_differ_are_told_beside_their_mean(tmp_path: Path, faster_hz: float, says: str, marks: int) -> None:
+def test_a_speed_range_is_reported_beside_the_mean(tmp_path: Path, faster_hz: float, says: str, marks: int) -> None:
     time, x, v, _ = signals(8000)
     turns = np.where(time < 2, 20.0, faster_hz) * (time - 2) + 0.253
     source = archive(tmp_path, x=x, v=v, k=np.mod(marks * turns, 1.0) < 0.5)

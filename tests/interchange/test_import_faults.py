@@ -1,4 +1,4 @@
-"""What is wrong with a mapping, a file or a command is named; acceleration is integrated right above its frequency."""
+"""Mistakes in a mapping, a file or a command are named; acceleration is integrated exactly above its limit."""
 
 import re
 from pathlib import Path
@@ -38,11 +38,11 @@ from tests.interchange.material import (
 from tests.service.rig.preloaded import rotorwatch as run
 
 IN_ORDER = CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3")
-"""Channels by their number, of files without names."""
+"""Channels by column number, for files without names."""
 
 
 @pytest.mark.parametrize(("start", "day"), [("datenum", 740013.5), ("1899-12-30T00:00:00Z", 46053.5)])
-def test_days_of_matlab_and_of_a_spreadsheet_are_times(tmp_path: Path, start: str, day: float) -> None:
+def test_day_numbers_of_matlab_and_spreadsheets_are_times(tmp_path: Path, start: str, day: float) -> None:
     rows = [f"{day + number / 2000 / 86_400:.12f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
     mapping = TEXT.replace(START, start).replace("[time]", '[time]\nunit = "d"')
     done, _ = imported(tmp_path, table(tmp_path / "run.csv", rows), mapping)
@@ -126,7 +126,7 @@ def test_days_of_matlab_and_of_a_spreadsheet_are_times(tmp_path: Path, start: st
         *("no row", "one row", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_table_is_named(
+def test_mistakes_in_a_table_are_named(
     tmp_path: Path, rows: list[str], mapping: str, header: str, said: tuple[str, ...]
 ) -> None:
     text = fault(tmp_path, rows, mapping, header)
@@ -154,7 +154,7 @@ def test_a_wrong_mapping_is_named_by_field(tmp_path: Path, old: str, new: str, s
 
 
 @pytest.mark.parametrize("number", [np.float32, np.int16])
-def test_a_wav_file_that_was_cut_is_refused_with_what_is_there(tmp_path: Path, number: type) -> None:
+def test_a_truncated_wav_file_is_refused_with_its_sample_counts(tmp_path: Path, number: type) -> None:
     samples: np.ndarray = np.random.default_rng(60161).uniform(-100, 100, (1000, 3)).astype(number)
     wavfile.write(tmp_path / "run.wav", 2000, samples)
     mapping = f'[time]\nstart = "{START}"\n' + IN_ORDER
@@ -198,13 +198,13 @@ def test_a_number_that_is_not_finite_is_refused_or_a_gap(tmp_path: Path, cell: s
         (19997, "resample = true", "19997 and 2000 samples per second are not in a ratio of whole numbers"),
     ],
 )
-def test_a_rate_of_the_header_that_is_none_is_refused(tmp_path: Path, rate_hz: int, wish: str, said: str) -> None:
+def test_a_contradictory_or_unusable_header_rate_is_refused(tmp_path: Path, rate_hz: int, wish: str, said: str) -> None:
     wavfile.write(tmp_path / "run.wav", rate_hz, np.zeros((1000, 3), dtype=np.float32))
     with pytest.raises(MachineFileError, match=said):
         imported(tmp_path, tmp_path / "run.wav", f'[time]\n{wish}\nstart = "{START}"\n{IN_ORDER}')
 
 
-def test_a_rate_that_the_header_rounds_is_that_of_the_mapping(tmp_path: Path) -> None:
+def test_a_rate_rounded_in_the_header_is_taken_from_the_mapping(tmp_path: Path) -> None:
     wavfile.write(tmp_path / "run.wav", 17067, np.zeros((20_000, 3), dtype=np.float32))
     mapping = f'[time]\nrate_hz = {51200 / 3!r}\nstart = "{START}"\n{IN_ORDER}'
     done, _ = imported(tmp_path, tmp_path / "run.wav", mapping, machine(rate_hz=51200 / 3, window={}))
@@ -219,12 +219,12 @@ def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
         imported(tmp_path, tmp_path / "run.npz", mapping)
 
 
-def test_blanks_around_the_names_of_a_csv_file_are_none_of_the_names(tmp_path: Path) -> None:
+def test_blanks_around_csv_column_names_are_ignored(tmp_path: Path) -> None:
     done, _ = imported(tmp_path, table(tmp_path / "run.csv", GOOD, "t, x, v , a"), TEXT)
     assert done.written.samples == 1000
 
 
-def test_a_header_in_another_encoding_is_told_with_the_field_that_says_it(tmp_path: Path) -> None:
+def test_a_header_in_another_encoding_is_refused_naming_the_setting(tmp_path: Path) -> None:
     source = tmp_path / "run.csv"
     source.write_bytes("\n".join(["t,x,v,a,µ", *(f"{row},0" for row in GOOD), ""]).encode("latin-1"))
     with pytest.raises(MachineFileError, match=r"run.csv: .*taken as utf-8 .*\[csv\] in the mapping .* encoding"):
@@ -233,7 +233,7 @@ def test_a_header_in_another_encoding_is_told_with_the_field_that_says_it(tmp_pa
     assert done.written.samples == 1000
 
 
-def test_a_point_where_the_decimal_sign_is_a_comma_is_named_with_its_cell(tmp_path: Path) -> None:
+def test_a_decimal_point_among_decimal_commas_is_named_with_its_cell(tmp_path: Path) -> None:
     rows = [row.replace(",", ";").replace(".", ",") for row in GOOD]
     rows[736] = rows[736].replace(",", ".")
     text = fault(tmp_path, rows, '[csv]\ndelimiter = ";"\ndecimal = ","\n' + TEXT, "t;x;v;a")
@@ -248,7 +248,7 @@ def test_a_number_that_the_samples_of_the_machine_cannot_hold_is_refused(tmp_pat
     assert done.written.samples == 1000
 
 
-def test_a_wav_file_whose_header_has_no_rate_asks_for_it(tmp_path: Path) -> None:
+def test_a_wav_file_without_a_rate_in_its_header_needs_one_in_the_mapping(tmp_path: Path) -> None:
     source = tmp_path / "run.wav"
     wavfile.write(source, 2000, np.zeros((1000, 3), dtype=np.float32))
     source.write_bytes(source.read_bytes()[:24] + bytes(4) + source.read_bytes()[28:])
@@ -259,7 +259,7 @@ def test_a_wav_file_whose_header_has_no_rate_asks_for_it(tmp_path: Path) -> None
     assert done.written.samples == 1000
 
 
-def test_texts_of_a_tdms_file_that_are_no_rate_and_no_time_are_left_to_the_mapping(tmp_path: Path) -> None:
+def test_unusable_rate_and_time_texts_of_a_tdms_file_are_left_to_the_mapping(tmp_path: Path) -> None:
     source = tmp_path / "run.tdms"
     told = {"wf_increment": "0,0005", "wf_start_time": "31.01.2026 12:00"}
     with nptdms.TdmsWriter(source) as writer:
@@ -297,7 +297,7 @@ EXAMPLE = ROOT / "docs" / "examples" / "fe_rotor"
 
 
 def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """A file as the example's mapping expects it; its samples in um and mm/s."""
+    """Write a file as the example's mapping expects it; return its samples in µm and mm/s."""
     time = np.arange(20_000) / 2000.0
     angle = 2 * np.pi * 1773 / 60 * time
     motion = np.column_stack(
@@ -310,7 +310,7 @@ def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     return np.asarray(q * scale * np.r_[np.full(4, 1e6), np.full(4, 1e3)])
 
 
-def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
+def test_the_documented_example_is_imported_and_exported(tmp_path: Path) -> None:
     expected = sample(tmp_path / "healthy.npz")
     recording, machine = tmp_path / "healthy.mcap", EXAMPLE / "machine.toml"
     found = run(
@@ -330,7 +330,7 @@ def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
     assert pyarrow.parquet.read_metadata(out).num_rows == 4000
 
 
-def test_a_folder_without_its_bad_file_is_exit_code_1(tmp_path: Path) -> None:
+def test_importing_a_folder_with_a_bad_file_exits_1(tmp_path: Path) -> None:
     folder, mapping, recording = tmp_path / "files", tmp_path / "mapping.toml", tmp_path / "run.mcap"
     folder.mkdir()
     sample(folder / "20260101T000000.npz")
@@ -382,7 +382,7 @@ def test_a_sine_is_integrated_exactly_above_the_limit(frequency_hz: float, times
     assert np.abs(found - exact)[edge:-edge].max() < 0.005 / omega**times
 
 
-def test_what_is_slow_is_not_measured_and_comes_out_as_nothing() -> None:
+def test_motion_far_below_the_limit_is_integrated_to_zero() -> None:
     time = np.arange(80_000) / 2000.0
     drift = np.sin(2 * np.pi * 0.1 * time) + 0.01 * time
     found = integrated(drift, 2000.0, 2, HIGH_PASS_HZ)
@@ -412,7 +412,7 @@ def test_a_file_of_accelerations_becomes_velocity_and_displacement(tmp_path: Pat
     assert "below 3 Hz" not in text  # the machine's band begins there
 
 
-def test_a_limit_within_the_machines_band_is_said(tmp_path: Path) -> None:
+def test_an_integration_limit_within_the_machines_band_is_noted(tmp_path: Path) -> None:
     source = archive(tmp_path, acc=np.sin(np.arange(40_000) * 0.1), a=np.zeros(40_000))
     told = summary(tmp_path, source, MAPPING.replace("= 1.5", "= 5.0"))
     assert "window.band_hz = 3 Hz on, which is below 10 Hz" in told

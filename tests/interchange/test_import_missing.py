@@ -1,4 +1,4 @@
-"""Where a file lacks numbers of single channels, these are told as missing, and the others imported and evaluated."""
+"""Channels that lack numbers in a file are reported as missing, and the others imported and evaluated."""
 
 import json
 import re
@@ -59,7 +59,7 @@ def reports_of(recording: Path) -> list[Report]:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_a_probe_that_was_dead_for_a_while_is_told_and_the_others_are_evaluated(tmp_path: Path, kind: str) -> None:
+def test_a_temporarily_dead_probe_is_reported_and_the_others_are_evaluated(tmp_path: Path, kind: str) -> None:
     samples = np.concatenate([block.samples for block in scenario_blocks(40.0)]).astype(np.float64)
     time_ns = 1_769_860_800 * 10**9 + np.arange(len(samples)) * 500_000
     columns = {channel.name: samples[:, number] for number, channel in enumerate(KIT.sensors)}
@@ -101,7 +101,7 @@ def test_an_empty_cell_takes_its_channel_out_of_one_block(tmp_path: Path, cell: 
     expected = np.column_stack(signals(1000)[1:])
     expected[600:800, 1] = np.nan
     np.testing.assert_array_equal(samples_of(recording, machine()), expected)
-    # What is exported of it is imported again as the same.
+    # An export of the recording imports identically.
     export(Selection((recording,)), "stream", "csv", tmp_path / "again.csv")
     again = TEXT.replace("[time]", MISSING).replace(f'start = "{START}"', 'unit = "ns"\nstart = "unix"')
     for name, column in {"t": "time_ns", "x": "y1 [um]", "v": "y1_dot [mm/s]", "a": "theta [rad]"}.items():
@@ -128,13 +128,13 @@ def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("handling", ["missing", "gap"])
-def test_a_file_without_any_numbers_is_refused_for_that(tmp_path: Path, handling: str) -> None:
+def test_a_file_without_any_numbers_is_refused(tmp_path: Path, handling: str) -> None:
     mapping = TEXT.replace("[time]", MISSING.replace("missing", handling))
     told = fault(tmp_path, [f"{row.split(',')[0]},,," for row in good_rows()], mapping)
     assert "1000 rows, 1000 of them without numbers, 0 gaps: no stretch is long enough" in told
 
 
-def test_a_file_in_which_every_channel_lacks_numbers_in_every_block_is_refused_for_that(tmp_path: Path) -> None:
+def test_a_file_with_numbers_missing_in_every_channel_of_every_block_is_refused(tmp_path: Path) -> None:
     rows = [row.split(",") for row in good_rows()]
     for number, row in enumerate(rows):
         row[1 + number % 3] = ""
@@ -154,7 +154,7 @@ def test_a_column_of_a_lower_rate_is_told_not_to_be_usable(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path: Path, kind: str) -> None:
+def test_a_channel_with_no_data_in_the_file_is_missing_throughout(tmp_path: Path, kind: str) -> None:
     rows = [",".join([t, x, "", a]) for t, x, _, a in (row.split(",") for row in good_rows())]
     source = table(tmp_path / "run.csv", rows)
     if kind == "parquet":  # in which such a column has no type
@@ -165,7 +165,7 @@ def test_a_channel_of_which_the_file_has_nothing_is_missing_throughout(tmp_path:
     assert np.isnan(samples_of(recording, machine())).all(axis=0).tolist() == [False, True, False]
 
 
-def test_a_keyphasor_that_gives_no_pulses_takes_the_angle_alone(tmp_path: Path) -> None:
+def test_missing_keyphasor_pulses_make_only_the_angle_missing(tmp_path: Path) -> None:
     time, x, v, a = signals(8000)
     pulse = np.where((a < 0.8) & ~((time > 1.5) & (time < 2.5)), 5.0, 0.0)
     pulse[5000:5100] = np.nan
@@ -184,9 +184,7 @@ def test_a_keyphasor_that_gives_no_pulses_takes_the_angle_alone(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("rate_hz", [2000.0, 5000.0])
-def test_what_filters_make_of_missing_numbers_is_missing_and_the_rest_as_without(
-    tmp_path: Path, rate_hz: float
-) -> None:
+def test_only_what_filters_derive_from_missing_numbers_is_missing(tmp_path: Path, rate_hz: float) -> None:
     count = int(120 * rate_hz)
     time, x, _, a = signals(count, rate_hz)
     omega = 2 * np.pi * SPEED_HZ
@@ -207,7 +205,7 @@ def test_what_filters_make_of_missing_numbers_is_missing_and_the_rest_as_without
     lost = np.isnan(samples)
     assert lost.any(axis=0).tolist() == [True, True, False]
     assert lost[:, 0].sum() <= 2 * 200
-    # The second in which it was dead, 2.5 s to either side in which the filter settles, and what is left of blocks.
+    # The dead second, 2.5 s of filter settling on either side, and the rest of the blocks.
     settling = lost[:, 1] & (np.arange(len(lost)) > 20_000)
     assert settling.sum() / 2000 == pytest.approx(6.0, abs=0.25)
     np.testing.assert_allclose(samples[~lost], whole[~lost], atol=0.02)

@@ -1,4 +1,4 @@
-"""Whatever the gaps, the units and the pulses of a keyphasor: nothing is invented, shifted or lost."""
+"""Whatever the gaps, units and keyphasor pulses of a file, nothing is invented, shifted or lost."""
 
 import itertools
 from pathlib import Path
@@ -139,7 +139,7 @@ def test_jitter_and_drift_make_no_gaps(tmp_path_factory: pytest.TempPathFactory,
 
 
 @pytest.mark.parametrize("missing", [1, 3, 9])
-def test_gaps_up_to_the_declared_limit_are_bridged_and_said(tmp_path: Path, missing: int) -> None:
+def test_gaps_up_to_the_declared_limit_are_bridged_and_counted(tmp_path: Path, missing: int) -> None:
     rows = 3000
     time, x, v, a = signals(rows)
     present = np.r_[0:1500, 1500 + missing : 2000, 2300:rows]
@@ -160,7 +160,7 @@ def test_gaps_up_to_the_declared_limit_are_bridged_and_said(tmp_path: Path, miss
 
 
 @pytest.mark.parametrize(("rate_hz", "ratio"), [(5000.0, "2/5"), (1600.0, "5/4"), (2560.0, "25/32")])
-def test_another_rate_is_resampled_in_pieces_as_in_one(tmp_path: Path, rate_hz: float, ratio: str) -> None:
+def test_a_file_at_another_rate_is_resampled_to_the_machines_rate(tmp_path: Path, rate_hz: float, ratio: str) -> None:
     rows = int(rate_hz * 45)
     _, x, v, a = signals(rows, rate_hz)
     pa.parquet.write_table(pa.table({"x": x + 5000, "v": v, "a": a}), tmp_path / "run.parquet")
@@ -240,7 +240,7 @@ def test_unusable_pulses_are_named(times: list[float], said: str) -> None:
 
 @settings(max_examples=50)
 @given(cuts=st.lists(st.integers(1, 3999), max_size=8, unique=True), rising=st.booleans())
-def test_edges_are_the_same_in_whatever_pieces_the_signal_comes(cuts: list[int], rising: bool) -> None:
+def test_edges_do_not_depend_on_how_the_signal_is_split(cuts: list[int], rising: bool) -> None:
     time = np.arange(4000) / RATE_HZ
     noise = 0.3 * np.random.default_rng(2).standard_normal(4000)
     signal = (1 if rising else -1) * (4 * (np.mod(SPEED_HZ * time, 1) > 0.8) + noise)
@@ -272,7 +272,7 @@ def test_pulse_times_of_a_file_become_its_shaft_angle(tmp_path: Path) -> None:
     assert off_by(found.samples[:, 2], angle).max() < 1e-6
 
 
-def test_pulses_of_a_time_column_count_from_its_zero(tmp_path: Path) -> None:
+def test_pulse_times_share_the_zero_of_the_time_column(tmp_path: Path) -> None:
     time, x, v, angle = signals(20_000)
     source = archive(tmp_path, t=time + 77, x=x, v=v, k=np.arange(0, 10, 1 / SPEED_HZ) + 77)
     mapping = PULSES.replace("rate_hz = 2000.0", 'column = "t"') + 'pulse_times = "k"\n'
@@ -287,13 +287,13 @@ def test_a_sampled_tachometer_becomes_the_shaft_angle(tmp_path: Path) -> None:
     keyphasor = 'column = "tacho"\nthreshold = 2.0\nhysteresis = 0.5\npulses_per_revolution = 8\n'
     _, recording = imported(tmp_path, source, PULSES + keyphasor)
     (found,) = stretches(recording)
-    # Which of the eight teeth is the first is not known: the angle is right but for a constant eighth.
+    # Which of the eight teeth is the first is not known: the angle is right except for constant eighths.
     difference = np.angle(np.exp(1j * (found.samples[:, 2] - angle[-found.samples.shape[0] :])))
     assert np.ptp(difference) < 0.01
     assert found.samples.shape[0] >= 140_000 - RATE_HZ / SPEED_HZ / 8
 
 
-def test_where_the_shaft_stood_there_is_a_gap(tmp_path: Path) -> None:
+def test_a_stopped_shaft_leaves_a_gap(tmp_path: Path) -> None:
     _, x, v, _ = signals(20_000)
     pulses = np.arange(0, 10, 1 / SPEED_HZ)
     source = archive(tmp_path, x=x, v=v, k=pulses[(pulses < 4) | (pulses > 6)])

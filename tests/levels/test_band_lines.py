@@ -1,4 +1,4 @@
-"""A line that the healthy machine did not have is told, however loud the healthy machine was in another condition."""
+"""A line that the healthy machine did not have is reported, however loud that machine was in another condition."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def window(
     seed: int, *, loud: float = 1.0, mesh: float = 0.0, damping: float = 0.02, wander: float = 0.0,
     speed_hz: float = SPEED_HZ, unbalance: float = 0.5, known: bool = True,
 ) -> WindowLevels:  # fmt: skip
-    """A resonance at 480 Hz that noise excites so loud, 1x, and a mesh of 22 teeth in the first channel.
+    """A resonance at 480 Hz under noise of level `loud`, 1x, and a mesh of 22 teeth in the first channel.
 
     The speed may wander up and down within a hop, and the shaft angle be known or not.
     """
@@ -57,11 +57,11 @@ def told(levels: WindowLevels, healthy: list[WindowLevels] | LevelReference) -> 
 
 @pytest.fixture(scope="module")
 def healthy() -> list[WindowLevels]:
-    """In three conditions, in one of which it is ten times as loud as in another."""
+    """Windows of three conditions, one of them ten times as loud as another."""
     return [window(number, loud=loud) for number, loud in enumerate([0.3, 0.3, 1.0, 1.0, 3.0, 3.0])]
 
 
-def test_a_new_line_is_told_where_no_level_has_grown(healthy: list[WindowLevels]) -> None:
+def test_a_new_line_is_reported_although_no_level_has_grown(healthy: list[WindowLevels]) -> None:
     levels = window(100, loud=0.3, mesh=0.4)
     text = told(levels, healthy)
     assert "a line within 460 to 487 Hz (20.9 to 22.1 times running speed" in text
@@ -78,7 +78,7 @@ def test_noise_is_no_line_whatever_its_level_or_resonance(healthy: list[WindowLe
 
 
 @pytest.mark.filterwarnings("error")
-def test_neither_is_one_that_is_little_of_the_vibration_nor_no_signal_at_all(healthy: list[WindowLevels]) -> None:
+def test_a_weak_line_or_a_dead_signal_is_not_reported(healthy: list[WindowLevels]) -> None:
     assert told(window(300, loud=3.0, mesh=0.3), healthy) == ""
     assert told(window(820, loud=0.0, unbalance=0.0), healthy) == ""
 
@@ -88,7 +88,7 @@ def test_an_unbalance_is_no_new_line() -> None:
     assert "a line" not in told(window(710, loud=0.3, speed_hz=100.0, unbalance=1.0), balanced)
 
 
-def test_where_the_speed_is_not_known_a_line_is_part_of_all_vibration() -> None:
+def test_without_a_known_speed_a_line_is_compared_with_all_vibration() -> None:
     healthy = [window(800 + number, loud=0.3, known=False) for number in range(4)]
     text = told(window(810, loud=0.3, mesh=0.4, known=False), healthy)
     assert "a line within 460 to 487 Hz (27% of the vibration of V) that" in text
@@ -96,46 +96,46 @@ def test_where_the_speed_is_not_known_a_line_is_part_of_all_vibration() -> None:
 
 
 @pytest.mark.parametrize("wander", [0.0, 0.01])
-def test_a_line_of_the_healthy_machine_is_none_steadier_or_not(wander: float) -> None:
+def test_a_line_of_the_healthy_machine_is_not_new_whether_steadier_or_not(wander: float) -> None:
     geared = [window(400 + number, mesh=0.4, loud=0.3, wander=wander) for number in range(6)]
-    for mesh in (0.2, 0.5, 1.0):  # nor is one that has grown a rub, for it clips nothing
+    for mesh in (0.2, 0.5, 1.0):  # nor is a grown line a rub, as it clips nothing
         assert told(window(500, mesh=mesh, loud=0.3), geared) == ""
     assert "a line" not in told(window(501, mesh=0.5, loud=0.3, wander=0.005), geared)
 
 
-def test_a_line_that_noise_or_an_unsteady_speed_hid_on_the_healthy_machine_is_not_told() -> None:
+def test_a_line_hidden_by_noise_or_unsteady_speed_at_commissioning_is_not_new() -> None:
     under_noise = [window(900 + number, mesh=0.15) for number in range(4)]
     assert "a line" not in told(window(910, mesh=0.15, loud=0.1), under_noise)
     spread = [window(920 + number, mesh=0.4, loud=0.3, wander=0.03) for number in range(4)]
     assert "a line" not in told(window(930, mesh=0.4, loud=0.3), spread)
 
 
-def test_commissionings_and_plans_without_lines_have_none_to_tell(healthy: list[WindowLevels]) -> None:
+def test_without_lines_at_commissioning_none_are_reported(healthy: list[WindowLevels]) -> None:
     assert level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0)).lines is False
     without = [type(one)(one.values, one.errors, one.vectors, one.speed_rad_s, one.hops, one.bands) for one in healthy]
     assert told(window(600, loud=0.3, mesh=0.4), without) == ""
 
 
 def by_theory(levels: WindowLevels, damping: float, natural_hz: float = 480.0, speed_hz: float = SPEED_HZ) -> str:
-    """What is told of a machine with this mode that nobody has commissioned."""
+    """What is reported for an uncommissioned machine with this mode."""
     speeds = (0.9 * 2 * np.pi * speed_hz, 1.1 * 2 * np.pi * speed_hz)
     return told(levels, expected_levels(NAMES, levels, speeds, [(natural_hz, damping)]))
 
 
 @pytest.mark.parametrize("damping", [0.02, 0.001])
-def test_a_machine_that_was_not_commissioned_has_the_lines_of_theory(damping: float) -> None:
+def test_an_uncommissioned_machine_is_compared_with_the_lines_of_theory(damping: float) -> None:
     assert not any(by_theory(window(100 + n, damping=damping, loud=loud), damping) for n, loud in enumerate([0.3, 3.0]))
     text = by_theory(window(102, mesh=4.0, damping=damping), damping)
     assert "a line within 4" in text
     assert "that no rotor of the machine file makes" in text
 
 
-def test_a_mode_without_damping_cannot_be_told_from_a_line() -> None:
+def test_a_line_at_a_mode_without_damping_is_not_reported() -> None:
     assert not by_theory(window(104, mesh=4.0), 1e-5)
-    assert by_theory(window(104, mesh=4.0), 1e-5, natural_hz=700.0)  # that of another frequency can
+    assert by_theory(window(104, mesh=4.0), 1e-5, natural_hz=700.0)  # a mode at another frequency can
 
 
-def test_running_speed_that_goes_away_from_its_mean_is_no_line() -> None:
+def test_running_speed_away_from_its_mean_is_no_line() -> None:
     slow = replace(window(105, speed_hz=137.0, unbalance=5.0), speed_rad_s=2 * np.pi * 150.0)
     assert not by_theory(replace(slow, speeds_rad_s=2 * np.pi * np.array([142.5, 157.5])), 0.02, speed_hz=150.0)
     assert by_theory(slow, 0.02, speed_hz=150.0)  # as if the speed had been steady

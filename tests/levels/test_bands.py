@@ -1,4 +1,4 @@
-"""Levels in narrow bands against closed forms, and what grows in one of them against a reference."""
+"""Levels in narrow bands against closed forms, and growth in one of them against a reference."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 
 
 def window(samples: FloatArray, count: int = HOPS) -> WindowLevels:
-    """Of a machine whose speed is not known; of its first hops."""
+    """Levels of the first hops of a machine of unknown speed."""
     return taken(PLAN, samples[: count * samples.size // HOPS, None], count)
 
 
@@ -49,7 +49,7 @@ def grown(samples: FloatArray, healthy: LevelReference) -> tuple[str, str]:
     return limits.state, limits.text
 
 
-def test_bands_hold_what_is_in_them() -> None:
+def test_bands_hold_the_rms_of_lines_and_noise_within_them() -> None:
     bands = sure(window(noise(1) + line(97.3, 4.0)).bands)
     low, high = bands.edges_hz[:-1], bands.edges_hz[1:]
     within = (low < 97.3) & (high > 97.3)
@@ -65,7 +65,7 @@ HEALTHY = reference(*(noise(seed) + line(48.7, 1.0) + line(97.4, 0.3) for seed i
 
 
 @pytest.mark.parametrize("hz", [24.35, 48.7, 97.4, 130.0, 613.0])
-def test_a_line_that_doubles_or_comes_is_found_at_whatever_frequency(hz: float) -> None:
+def test_a_line_that_doubles_or_appears_is_found_at_any_frequency(hz: float) -> None:
     healthy = noise(11) + line(48.7, 1.0) + line(97.4, 0.3)
     assert grown(healthy, HEALTHY)[0] == "normal"
     state, text = grown(healthy + line(hz, 1.0 if hz < 200 else 2.0), HEALTHY)
@@ -80,12 +80,12 @@ def test_healthy_windows_raise_nothing() -> None:
     """200 windows of 110 bands; at six standard errors chance raises none."""
     raised = sum(grown(noise(1000 + n) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] != "normal" for n in range(200))
     assert raised == 0
-    # Nor lines that move with the speed, nor excitation that grows in all bands alike: that is the overall level's.
+    # Nor do lines that move with the speed, nor growth in all bands alike, which the overall level shows.
     assert grown(noise(12) + line(50.2, 1.0) + line(100.4, 0.3), HEALTHY)[0] == "normal"
     assert grown(1.55 * noise(13) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] == "normal"
 
 
-def test_what_varied_in_a_band_may_vary() -> None:
+def test_a_band_may_vary_as_much_as_it_did_at_commissioning() -> None:
     varied = reference(*(noise(seed) + line(48.7, level) for seed, level in enumerate((0.5, 1.0, 2.0))))
     assert grown(noise(11) + line(48.7, 2.4), varied)[0] == "normal"
     assert grown(noise(11) + line(48.7, 3.0), varied)[0] == "alert"
@@ -117,7 +117,7 @@ def test_without_a_reference_or_with_one_of_other_bands_nothing_has_grown() -> N
     assert judged(noise(1), other).limit("growth") is None
 
 
-def test_first_windows_remember_their_bands() -> None:
+def test_bands_of_the_first_windows_survive_a_restart() -> None:
     first = FirstWindows(["DE"], 3)
     first.take(0, 1, window(noise(1)))
     again = FirstWindows(["DE"], 3)

@@ -1,4 +1,4 @@
-"""A shaft that touches is told from one that does not, whatever else moves it."""
+"""Contact of a shaft is detected, whatever else moves the shaft."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def told(
     line: tuple[float, float] = (0.0, 1.0), spikes: float = 0.0, angle_deg: float = 90.0, rate_hz: float = 2000.0,
     velocity: bool = False, mode_hz: float = MODE_HZ,
 ) -> FloatArray:  # fmt: skip
-    """Of a disc on a shaft of stiffness one, shaken at random to an rms of about one, with noise of one per cent."""
+    """Contact statistics of a disc on a shaft of stiffness one, random motion of rms about one, and 1 % noise."""
     rng, omega, dt = np.random.default_rng(seed), 2 * np.pi * mode_hz, 1 / rate_hz
     n = round(N * rate_hz / 2000.0)
     angle = 2 * np.pi * SPEED_HZ * dt * np.arange(n)
@@ -92,7 +92,7 @@ def z(found: FloatArray) -> FloatArray:
         *((True, how) for how in ({}, {"line": (0.5, 0.6)}, {"unbalance": 3.0}, {"rate_hz": 4000.0}, {"spikes": 6.0})),
     ],
 )
-def test_without_a_contact_it_is_standard_normal_or_less_of_velocities(velocity: bool, how: dict[str, Any]) -> None:
+def test_without_contact_it_is_standard_normal_or_lower_for_velocities(velocity: bool, how: dict[str, Any]) -> None:
     found = told(20261131 if velocity else 20261126, velocity=velocity, **how)
     assert np.all(z(found) < 4.5)
     assert velocity or np.all(z(found) > -4.5)
@@ -112,17 +112,17 @@ def test_a_slow_rotor_sampled_many_times_a_turn_is_not_pushed_back() -> None:
         *((0, 20261128, {"clearance": 2.5, "stiff": 1.0} | how) for how in ({"rate_hz": 4000.0}, {"angle_deg": 60.0})),
     ],
 )  # fmt: skip
-def test_a_contact_is_seen_whatever_the_quantity_the_rate_and_the_angle(
+def test_a_contact_is_detected_for_any_quantity_rate_and_probe_angle(
     which: int, seed: int, how: dict[str, Any]
 ) -> None:
     assert z(told(seed, **how))[which] > 6
 
 
-def test_a_contact_that_is_over_after_a_few_samples_is_seen() -> None:
+def test_a_contact_of_a_few_samples_is_detected() -> None:
     assert z(told(20261127, clearance=2.8, stiff=4.0, mode_hz=200.0))[0] > 6
 
 
-def test_velocities_are_looked_at_where_a_place_has_no_two_displacements() -> None:
+def test_velocities_are_used_at_places_without_two_displacements() -> None:
     def contacts(*channels: tuple[str, str, str]) -> list[tuple[int, int]]:
         plan = level_plan([channel(one, way, place) for one, way, place in channels], 2000.0, (10.0, 1000.0))
         return [(first, second) for first, second, _ in plan.contacts]
@@ -133,12 +133,12 @@ def test_velocities_are_looked_at_where_a_place_has_no_two_displacements() -> No
     assert contacts(*velocities, ("displacement", "y", "disc")) == [(0, 1), (2, 3)]
 
 
-def test_single_samples_that_are_off_are_no_contact() -> None:
+def test_outlying_single_samples_are_no_contact() -> None:
     assert np.all(z(told(20261130, spikes=6.0)) < 4.5)
 
 
 @pytest.mark.parametrize("change", ["short", "dead", "copied", "coarse"])
-def test_it_is_not_known_where_nothing_can_be_told(change: str) -> None:
+def test_unusable_signals_show_no_contact(change: str) -> None:
     pair = np.random.default_rng(20261129).standard_normal((2, 900 if change == "short" else N))
     pair[1] = {"short": pair[1], "dead": 0.0, "copied": pair[0], "coarse": np.round(8 * pair[1])}[change]
     angle = 0.07 * np.arange(pair.shape[1])
@@ -152,9 +152,9 @@ HEALTHY = HopReference(mean=0.0, scatter=1.0, hops=144, range=0.5)
 
 
 def heard(hops: FloatArray, *, faster: int | None = None, stop: int | None = None, window: int = WINDOW) -> list[int]:
-    """After how many hops, each of the two numbers of a pair, a contact is told; shape (n_hops, 2).
+    """Numbers of hops after which a contact is reported, given the two statistics of hops, shape (n_hops, 2).
 
-    After so many the machine runs ``faster``, or the monitor is stopped and another one goes on.
+    After `faster` hops the machine runs faster; after `stop` hops another monitor takes over.
     """
     contacts = {one.name: HEALTHY for one in PAIR}
     slow, fast = (
@@ -181,13 +181,13 @@ def hops_of(seed: int, before: int, touching: int, after: int = 0, *, size: floa
     return found
 
 
-def test_a_light_contact_is_told_after_some_minutes_and_stays_told() -> None:
+def test_a_light_contact_is_reported_after_some_minutes_and_stays_reported() -> None:
     for seed in range(20261201, 20261205):
         assert set(range(24 + LATEST, 24 + 97)) <= set(heard(hops_of(seed, 24, 96)))
         assert not heard(hops_of(seed, 960, 0))
 
 
-def test_one_hop_is_no_contact_and_one_that_is_over_is_told_no_more() -> None:
+def test_a_single_hop_is_no_contact_and_a_past_contact_is_no_longer_reported() -> None:
     once = hops_of(20261211, 120, 0)
     once[60] += 100.0
     assert not heard(once)
@@ -199,7 +199,7 @@ def test_one_hop_is_no_contact_and_one_that_is_over_is_told_no_more() -> None:
     assert max(over) < 24 + 24 + WINDOW
 
 
-def test_a_monitor_that_goes_on_knows_the_hops_before() -> None:
+def test_a_resumed_monitor_remembers_earlier_hops() -> None:
     light = hops_of(20261213, 24, 96)
     assert heard(light, stop=90) == heard(light)
 

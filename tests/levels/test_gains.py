@@ -1,4 +1,4 @@
-"""A wrong gain of a place against what changes of a machine and of its excitation look like."""
+"""A wrong gain at a place is distinguished from changes of the machine and of its excitation."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ def window(
     gains: Sequence[float] = (1.0, 1.0, 1.0),
     pole: float = 0.5,
 ) -> BandLevels:
-    """Noise that all places share, of a colour by its pole, and some of their own, each with a resonance."""
+    """Shared noise, coloured by `pole`, and some independent noise, through a resonance at each place."""
     rng, n = np.random.default_rng([20261130, seed]), round(HOPS * HOP_S * RATE_HZ)
     shared = lfilter([1 - pole], [1, -pole], rng.standard_normal(n))
     columns = []
@@ -43,7 +43,7 @@ def window(
 
 @pytest.fixture(scope="module")
 def reference() -> GainReference:
-    """Of two recordings, of excitation of two colours."""
+    """Learned from two recordings with excitation of two colours."""
     return sure(
         learn_gains(PLACES, [[window(10 * n + k, pole=pole) for k in range(4)] for n, pole in ((1, 0.5), (2, 0.8))])
     )
@@ -51,7 +51,7 @@ def reference() -> GainReference:
 
 @pytest.mark.parametrize("at", range(3))
 @pytest.mark.parametrize("gain", [0.75, 1.2])
-def test_a_gain_is_told_with_its_place(reference: GainReference, at: int, gain: float) -> None:
+def test_a_wrong_gain_is_named_with_its_place(reference: GainReference, at: int, gain: float) -> None:
     gains = [1.0, 1.0, 1.0]
     gains[at] = gain
     found = sure(wrong_gain(window(100 + at, gains=gains, pole=0.8), PLACES, reference))
@@ -59,16 +59,14 @@ def test_a_gain_is_told_with_its_place(reference: GainReference, at: int, gain: 
     assert found[1] == pytest.approx(gain, rel=0.03)
 
 
-def test_a_resonance_that_moves_and_excitation_that_is_louder_or_of_another_colour_are_no_gain(
-    reference: GainReference,
-) -> None:
+def test_a_moved_resonance_or_a_changed_excitation_is_no_wrong_gain(reference: GainReference) -> None:
     for resonances_hz in ((36.0, 60.0, 90.0), (40.0, 52.0, 90.0), (40.0, 60.0, 100.0)):
         assert wrong_gain(window(200, resonances_hz), PLACES, reference) is None
     for seed, gain, pole in ((300, 1.0, 0.5), (301, 2.0, 0.8), (302, 0.5, 0.2), (303, 1.0, 0.95)):
         assert wrong_gain(window(seed, gains=(gain,) * 3, pole=pole), PLACES, reference) is None
 
 
-def test_nor_a_channel_that_is_dead_or_other_places_or_hops(reference: GainReference) -> None:
+def test_dead_channels_and_other_places_or_bands_give_no_wrong_gain(reference: GainReference) -> None:
     now = window(400)
     dead = replace(now, rms=now.rms * [0.0, 1.0, 1.0])
     assert wrong_gain(dead, PLACES, reference) is None
@@ -85,7 +83,7 @@ def test_nor_a_channel_that_is_dead_or_other_places_or_hops(reference: GainRefer
         ((np.nan, 0.0, 0.0), True),  # nothing is known
     ],
 )
-def test_what_turns_with_the_shaft_speaks_for_a_gain_or_against_it(changes: tuple[float, ...], *, fits: bool) -> None:
+def test_changes_of_1x_support_or_contradict_a_wrong_gain(changes: tuple[float, ...], *, fits: bool) -> None:
     errors = np.array([0.01, 0.004, 0.004])
     left = left_of_1x(np.array(changes), errors, PLACES, "bearing y", float(np.exp(0.15)))
     assert left == 0 if fits else left > 20
@@ -97,7 +95,7 @@ def test_two_sensors_of_a_place_count_once() -> None:
     assert left_of_1x(np.tile(changes, 2), np.tile(errors, 2), 2 * places, "bearing y", 1.15) == pytest.approx(once)
 
 
-def test_what_cannot_be_compared_is_not_learned() -> None:
+def test_gains_are_not_learned_from_windows_that_cannot_be_compared() -> None:
     windows = [window(500), window(501)]
     assert learn_gains(PLACES, [windows]) is not None
     assert learn_gains(PLACES, [windows[:1], windows[1:]]) is None  # no scatter

@@ -1,4 +1,4 @@
-"""What would have been seen: the growth of a level that raises an alert, in a commissioning and in every report."""
+"""The growth of a level that would raise an alert, as stated in a commissioning and in every report."""
 
 import math
 from typing import Any
@@ -42,7 +42,7 @@ def reference(*scales: float, speed_rad_s: float = 150.0, error: float = 0.01) -
 
 @pytest.mark.parametrize("scales", [(1.0,), (0.98, 1.0, 1.02), (0.6, 1.0, 1.9)])
 @pytest.mark.parametrize("error", [0.01, 0.3])
-def test_the_growth_that_is_stated_is_the_one_that_raises_an_alert(scales: tuple[float, ...], error: float) -> None:
+def test_the_stated_growth_is_the_one_that_raises_an_alert(scales: tuple[float, ...], error: float) -> None:
     healthy, settings = reference(*scales, error=error), LevelSettings()
     stated = list(alerts_of(healthy, CHANNELS, settings, 12))
     assert {(one.channel, one.measure) for one in stated} == {
@@ -73,12 +73,12 @@ def test_every_operating_state_has_growths_of_its_own() -> None:
     assert [one.growth for one in overall] == pytest.approx([0.6, 1.25 * 3 / 2 - 1])
 
 
-def test_a_level_that_was_nothing_has_no_growth() -> None:
+def test_a_level_of_zero_has_no_growth() -> None:
     (one, *_) = alerts_of(reference(0.0), CHANNELS, LevelSettings(), 12)
     assert one.growth is None
 
 
-def test_the_channel_that_is_watched_least_says_what_would_have_been_seen() -> None:
+def test_the_least_sensitive_channel_determines_the_growth_that_would_be_seen() -> None:
     of_d = {"channel": "D", "measure": "x2", "alert": 3}
     limits = [{"channel": "A", "alert": 0.6}, {"channel": "V", "alert": 2.8}, of_d]
     seen = growth_seen(judged(window(), limits=limits))
@@ -93,7 +93,7 @@ def test_the_channel_that_is_watched_least_says_what_would_have_been_seen() -> N
     assert sooner.growth == pytest.approx(0.6 * 9.80665 / 3.0 - 1, rel=1e-4)
 
 
-def test_a_limit_of_danger_alone_is_one_and_those_of_the_waveform_are_none() -> None:
+def test_danger_limits_count_for_growth_and_waveform_limits_do_not() -> None:
     limits: list[dict[str, Any]] = [{"channel": name, "danger": 100.0} for name in "AVD"]
     assert growth_seen(judged(window(), limits=limits)).growth == pytest.approx(100 * 9.80665 / 3.0 - 1, rel=1e-4)
     crest = [*limits, {"channel": "A", "measure": "crest", "alert": 3.1}]
@@ -101,7 +101,7 @@ def test_a_limit_of_danger_alone_is_one_and_those_of_the_waveform_are_none() -> 
     assert growth_seen(judged(window(), limits=crest)).measure == "overall"
 
 
-def test_a_channel_without_a_limit_is_said_to_be_watched_by_none() -> None:
+def test_channels_without_a_limit_are_named() -> None:
     seen = growth_seen(judged(window(), limits=[{"channel": "A", "alert": 0.6}]))
     assert (seen.growth, seen.channel, seen.measure) == (None, "V", "")
     assert seen.text == "no growth of V or D would have raised an alert: they have no limit yet"

@@ -24,7 +24,7 @@ SPEED = 2 * np.pi * 25
 def window(
     error: float = 0.0, speed_rad_s: float | None = SPEED, x1: complex | None = None, **si: float
 ) -> WindowLevels:
-    """Levels of one channel: nothing is known but what is given."""
+    """Levels of one channel; all that are not given are unknown."""
     values = {name: np.array([si.get(name, np.nan)]) for name in LEVEL_MEASURES}
     vectors = None
     if x1 is not None:
@@ -52,7 +52,7 @@ def limits(levels: ChannelLevels) -> dict[str, LevelLimits]:
     [(1.3, "A", "normal"), (2.7, "B", "normal"), (2.9, "C", "alert"), (4.4, "C", "alert"), (4.6, "D", "danger")],
 )
 @pytest.mark.parametrize("channel", [CASING, CASING_G])
-def test_zones_of_the_standard(channel: Channel, rms_mm_s: float, zone: str, state: str) -> None:
+def test_zones_follow_the_boundaries_of_the_standard(channel: Channel, rms_mm_s: float, zone: str, state: str) -> None:
     measure = "overall" if channel is CASING else "velocity"
     found = judged(channel, window(**{measure: rms_mm_s * 1e-3}), zones=["ISO 20816-3 group 2 rigid"])
     assert found.zone == zone
@@ -72,7 +72,7 @@ def test_zones_of_a_shaft_depend_on_the_speed() -> None:
 
 
 @pytest.mark.parametrize("name", ZONES)
-def test_boundaries_rise(name: str) -> None:
+def test_zone_boundaries_ascend(name: str) -> None:
     first, second, third = ZONES[name].boundaries
     assert 0 < first < second < third
     assert [zone_of(value, (first, second, third)) for value in (first, second, third, 2 * third)] == list("ABCD")
@@ -106,7 +106,7 @@ STEADY, VARIED = (0.98, 1.0, 1.02), (0.5, 1.0, 2.0)
         *((VARIED, 0.058, *one) for one in ((0.35, 16, "alert"), (0.35, 8, "normal"))),
     ],
 )
-def test_levels_relative_to_those_of_the_healthy_machine(
+def test_levels_are_judged_relative_to_those_of_the_healthy_machine(
     healthy: tuple[float, ...], error: float, overall: float, hops: int, state: str
 ) -> None:
     windows = [replace(window(error=1e-3 * error * one, overall=1e-3 * one), hops=16) for one in healthy]
@@ -116,7 +116,7 @@ def test_levels_relative_to_those_of_the_healthy_machine(
 
 
 @pytest.mark.parametrize("speed_rad_s", [SPEED, None, np.nan])
-def test_running_and_standing_are_each_compared_with_themselves(speed_rad_s: float | None) -> None:
+def test_running_and_standstill_are_each_compared_with_their_own_reference(speed_rad_s: float | None) -> None:
     still = [window(overall=0.1e-3, speed_rad_s=None) for _ in range(3)]
     ran = [window(overall=2e-3, speed_rad_s=SPEED) for _ in range(2)]
     level = 2e-3 if speed_rad_s == SPEED else 0.1e-3
@@ -137,7 +137,7 @@ def test_running_and_standing_are_each_compared_with_themselves(speed_rad_s: flo
         ((3e-5,) * 3, 1e-3, 2.6e-4, "danger"),
     ],
 )
-def test_a_line_that_was_noise_has_to_stand_out_and_is_a_danger_only_where_it_is_much_of_the_vibration(
+def test_a_line_once_within_noise_must_stand_out_and_is_danger_only_if_large(
     healthy: tuple[float, ...], overall: float, x2: float, state: str
 ) -> None:
     was = reference(*(window(error=1e-5, overall=overall, x2=value) for value in healthy))
@@ -179,13 +179,13 @@ def test_every_operating_state_has_levels_of_its_own() -> None:
     )
     assert (fast.state, slow.state, between.state) == ("normal", "danger", "alert")
     assert between.source == "commissioned at another speed"
-    # One that runs down through speeds that nobody knows has not fallen silent.
+    # A machine that runs down through unknown speeds has not fallen silent.
     healthy = reference(*(window(speed_rad_s=SPEED, overall=value) for value in (1e-3, 1.1e-3)))
     quiet = (limits(judged(CASING, window(speed_rad_s=speed, overall=1e-4), healthy)) for speed in (SPEED, SPEED / 2))
     assert [one["overall"].state for one in quiet] == ["alert", "normal"]
 
 
-def test_every_kind_of_limit_is_told_where_there_are_several() -> None:
+def test_every_limit_that_applies_to_a_level_is_listed() -> None:
     own = [{"channel": "DE-H", "alert": 3.0}, {"channel": "DE-H", "measure": "crest", "alert": 6.0}]
     healthy = reference(*(window(overall=1e-3) for _ in range(3)))
     level = window(overall=1.5e-3, crest=4.0)
@@ -221,7 +221,7 @@ def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
 
 
 @pytest.mark.parametrize(("times", "learned"), [(3.0, [True]), (5.0, [True, False])])
-def test_a_machine_that_stood_in_the_first_windows_is_learned_anew(times: float, learned: list[bool]) -> None:
+def test_a_machine_at_standstill_in_the_first_windows_is_learned_anew(times: float, learned: list[bool]) -> None:
     """But not one that has become louder, and turns visibly: it may have turned all the time."""
     first = FirstWindows(["DE-H"], 2, turns=True, since="May, new bearing")
     for number in range(8):

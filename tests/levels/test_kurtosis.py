@@ -1,4 +1,4 @@
-"""The kurtosis of a random part against closed forms, and what departs from a healthy machine's."""
+"""The kurtosis of a random part against closed forms, and departures from that of a healthy machine."""
 
 from collections.abc import Callable, Sequence
 
@@ -37,14 +37,14 @@ def kurtosis(samples: FloatArray, *, turning: bool = True) -> FloatArray:
 
 
 @pytest.mark.parametrize("lines", [(0.0, 0.0), (2.0, 0.0), (3.0, 1.0)])
-def test_gaussian_vibration_has_three_whatever_its_lines(lines: tuple[float, float]) -> None:
+def test_gaussian_vibration_has_kurtosis_three_whatever_its_lines(lines: tuple[float, float]) -> None:
     first, second = lines
     samples = noise(1) + first * np.cos(THETA + 0.4) + second * np.cos(2 * THETA)
     # 5000 samples a hop: their kurtosis scatters by √(24 / 60 000) over twelve of them
     assert kurtosis(samples).mean() == pytest.approx(3, abs=5 * np.sqrt(24 / T.size))
 
 
-def test_what_clips_is_below_and_what_knocks_above() -> None:
+def test_clipping_lowers_kurtosis_and_knocking_raises_it() -> None:
     # A normal variable clipped at 1.5 of its deviations, from its moments: 1.2357 / 0.7785².
     assert kurtosis(np.clip(noise(2), -1.5, 1.5)).mean() == pytest.approx(2.039, abs=0.03)
     knocks = np.zeros(T.size)
@@ -52,7 +52,7 @@ def test_what_clips_is_below_and_what_knocks_above() -> None:
     assert kurtosis(noise(3) + knocks).mean() > 6
 
 
-def test_without_a_known_rotation_nothing_is_said() -> None:
+def test_without_a_known_rotation_there_is_no_kurtosis() -> None:
     found = kurtosis(noise(4), turning=False)
     assert np.all(np.isnan(found))
     assert learn_hops([found]) is None
@@ -71,7 +71,7 @@ def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> N
         assert departure(kurtosis(samples), healthy, 6.0) == 0.0
 
 
-def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it() -> None:
+def test_a_departure_in_the_newest_half_of_a_window_is_detected() -> None:
     healthy, samples = reference(), noise(200) + 2 * np.cos(THETA)
     at = T.size // 2
     samples[at:] = np.clip(samples[at:], -2.5, 2.5)
@@ -81,7 +81,7 @@ def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it(
 def suspects(
     meshes: Sequence[float], healthy_mesh: float, spoilt: Callable[[FloatArray], FloatArray], *, phase: bool = True
 ) -> list[str]:
-    """What is said of windows with a gear mesh of these amplitudes beside noise, spoilt, on a machine commissioned."""
+    """Texts for spoilt windows of noise and a gear mesh of these amplitudes, on a commissioned machine."""
 
     def samples(seed: int, mesh: float) -> FloatArray:
         lines = 2 * np.cos(THETA) + mesh * np.cos(11 * THETA + seed)
@@ -107,7 +107,7 @@ def knocking(samples: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("healthy_mesh", [0.0, 1.5])
-def test_a_gear_mesh_that_grows_or_goes_is_no_rub_but_a_rub_is_one(healthy_mesh: float) -> None:
+def test_a_gear_mesh_that_grows_or_vanishes_is_no_rub_and_a_rub_is_found(healthy_mesh: float) -> None:
     meshes = (0.0, 0.7, 1.5, 3.0)
     assert suspects(meshes, healthy_mesh, lambda samples: samples) == [""] * 4
     assert all("clipped, as by a rub" in one for one in suspects(meshes, healthy_mesh, clipped))
@@ -115,19 +115,19 @@ def test_a_gear_mesh_that_grows_or_goes_is_no_rub_but_a_rub_is_one(healthy_mesh:
 
 
 def cycling(samples: FloatArray) -> FloatArray:
-    """Beside the same rotation a force that is twice as large every ten seconds as it is in between."""
+    """The samples with a random part that doubles every ten seconds, and the same rotation."""
     steady = 2 * np.cos(THETA)
     return np.asarray((samples - steady) * (1.5 + 0.5 * np.cos(2 * np.pi * T / 10)) + steady, dtype=np.float64)
 
 
-def test_a_load_that_cycles_is_no_impact_and_impacts_beside_it_are_told() -> None:
+def test_a_cycling_load_is_no_impact_and_impacts_beside_it_are_found() -> None:
     """Over a cycle such a force makes a kurtosis of 3.6, which healthy recordings of a steady load never have."""
     assert suspects((0.0,) * 4, 0.0, cycling) == [""] * 4
     assert all("with impacts" in one for one in suspects((0.0,) * 4, 0.0, lambda samples: knocking(cycling(samples))))
 
 
-def test_a_line_beside_the_rotation_beats_and_is_no_level_that_swells() -> None:
-    """Otherwise kurtosis would go with how fast it beats, which goes with the slip of a motor."""
+def test_kurtosis_does_not_depend_on_the_beat_of_a_line_beside_the_rotation() -> None:
+    """Otherwise kurtosis would vary with the beat frequency, and so with the slip of a motor."""
     found = []
     for number, beside_hz in enumerate((0.3, 0.6, 1.0, 1.3)):
         lines = 2 * np.cos(THETA) + 1.5 * np.cos(THETA + 2 * np.pi * beside_hz * T)
@@ -135,7 +135,7 @@ def test_a_line_beside_the_rotation_beats_and_is_no_level_that_swells() -> None:
     assert np.ptp(found) < 0.1
 
 
-def test_a_machine_commissioned_under_a_load_that_cycles_is_no_rub_once_the_load_is_steady() -> None:
+def test_a_steady_load_after_commissioning_under_a_cycling_one_is_no_rub() -> None:
     healthy = sure(learn_hops([kurtosis(cycling(noise(300 + n) + 2 * np.cos(THETA))) for n in range(5)]))
     for n in range(4):
         assert departure(kurtosis(noise(320 + n) + 2 * np.cos(THETA)), healthy, 6.0) == 0.0
@@ -161,18 +161,18 @@ def meshing_late(samples: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("spoilt", [stepping, knocking_once, humming, meshing_late])
-def test_a_step_one_knock_a_hum_beside_an_order_and_a_line_that_begins_are_neither(
+def test_a_step_a_single_knock_hum_and_a_new_line_are_neither_rub_nor_impact(
     spoilt: Callable[[FloatArray], FloatArray],
 ) -> None:
     assert suspects((0.0, 0.0, 0.0), 0.0, spoilt) == [""] * 3
 
 
-def test_a_rub_is_told_beside_a_line_that_begins() -> None:
+def test_a_rub_is_found_beside_a_line_that_begins() -> None:
     (found,) = suspects((0.0,), 0.0, lambda samples: clipped(meshing_late(samples)))
     assert "clipped, as by a rub" in found
 
 
-def test_less_will_do_to_doubt_what_else_was_found() -> None:
+def test_a_lower_threshold_detects_a_smaller_departure() -> None:
     healthy = HopReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
     assert departure(by_five_errors, healthy, 6.0) == 0.0
@@ -180,7 +180,7 @@ def test_less_will_do_to_doubt_what_else_was_found() -> None:
 
 
 @pytest.mark.parametrize("phase", [True, False])
-def test_vibration_that_has_become_louder_is_no_2x_but_a_2x_in_it_is_one(*, phase: bool) -> None:
+def test_louder_vibration_is_no_2x_and_a_2x_within_it_is_found(*, phase: bool) -> None:
     def louder(samples: FloatArray) -> FloatArray:
         return np.asarray(10 * (samples - 2 * np.cos(THETA)) + 2 * np.cos(THETA), dtype=np.float64)
 

@@ -38,7 +38,7 @@ def times(duration_s: float, rate_hz: float = RATE_HZ) -> FloatArray:
     return np.arange(round(duration_s * rate_hz)) / rate_hz
 
 
-def test_a_sine_in_every_quantity() -> None:
+def test_levels_of_a_sine_in_every_quantity() -> None:
     t = times(5.0)
     frequency_hz, amplitude = 49.73, 2e-3
     sine = amplitude * np.sin(2 * np.pi * frequency_hz * t)
@@ -67,7 +67,7 @@ def test_velocity_of_white_acceleration_is_its_spectrum_over_the_frequency_squar
     assert found.values["envelope"][0] == pytest.approx(found.values["high"][0] * np.sqrt(2 - np.pi / 2), rel=0.02)
 
 
-def test_the_standard_error_is_that_of_many_windows() -> None:
+def test_the_standard_error_matches_the_scatter_of_many_windows() -> None:
     rng = np.random.default_rng(82)
     sizes = plan("velocity", rate_hz=2560.0)
     windows = [taken(sizes, rng.standard_normal((2560 * 12, 1)), hops=12) for _ in range(60)]
@@ -103,7 +103,7 @@ def test_orders_with_a_phase_reference_are_amplitude_and_phase_lag() -> None:
 
 @pytest.mark.parametrize("n_samples", [10_000, 10_240, 9_973])
 @pytest.mark.parametrize("turns_hz", [(2, 2), (23.7, 23.7), (-23.7, -23.7), (124, 124), (310, 310), (5, 60)])
-def test_orders_are_those_of_a_fit_to_every_sample(n_samples: int, turns_hz: tuple[float, float]) -> None:
+def test_orders_equal_a_least_squares_fit_to_every_sample(n_samples: int, turns_hz: tuple[float, float]) -> None:
     rng, rate_hz = np.random.default_rng(97), 2000.0
     theta = 2 * np.pi * np.cumsum(np.linspace(*turns_hz, n_samples)) / rate_hz + 0.4
     regressors = np.stack([np.ones(n_samples), *(f(k * theta) for k in (0.5, 1, 2, 3) for f in (np.cos, np.sin))])
@@ -136,7 +136,7 @@ def test_a_neighbours_line_is_not_read_as_running_speed() -> None:
 
 
 @pytest.mark.parametrize("slope", [0.0, 1e-12, 1e-300])
-def test_an_angle_that_jumps_and_stands_between_ends_like_any_other(slope: float) -> None:
+def test_an_angle_that_jumps_and_pauses_gives_finite_sums(slope: float) -> None:
     n_samples = 10_000
     angle = slope * np.arange(n_samples) + 4.0 * (np.arange(n_samples) // 100)
     x = np.random.default_rng(98).standard_normal((n_samples, 1))
@@ -144,7 +144,7 @@ def test_an_angle_that_jumps_and_stands_between_ends_like_any_other(slope: float
     assert np.isfinite(found.sums[0]).all()
 
 
-def test_a_shaft_that_stands_still_has_no_orders() -> None:
+def test_a_stationary_shaft_has_no_orders() -> None:
     sizes = plan("velocity", rate_hz=2000.0)
     x = np.random.default_rng(84).standard_normal((10_000, 1))
     found = taken(sizes, x, angle_rad=np.full(10_000, 1.0), phase=True)
@@ -155,7 +155,7 @@ def test_a_shaft_that_stands_still_has_no_orders() -> None:
 
 
 @pytest.mark.parametrize("location", ["bearing", "DE"])
-def test_the_largest_radius_of_a_shaft_orbit(location: str) -> None:
+def test_s_max_is_the_largest_radius_of_the_shaft_orbit(location: str) -> None:
     t = times(5.0, 2000.0)
     theta = 2 * np.pi * 20 * t
     samples = np.column_stack([1e-4 + 30e-6 * np.cos(theta), -2e-4 + 40e-6 * np.cos(theta)])
@@ -166,7 +166,7 @@ def test_the_largest_radius_of_a_shaft_orbit(location: str) -> None:
     assert found["mean"] == pytest.approx([1e-4, -2e-4])
 
 
-def test_a_band_ends_where_the_sampling_rate_ends_it() -> None:
+def test_the_band_is_limited_by_the_sampling_rate() -> None:
     sizes = plan("velocity", "acceleration", rate_hz=1000.0)
     assert sizes.band_hz == (10.0, 400.0)
     assert sizes.high_hz is None
@@ -187,13 +187,13 @@ def test_the_largest_radius_is_the_same_for_probes_at_any_angle(angles: tuple[fl
     assert found["overall"] == pytest.approx([np.ptp(one) for one in seen])  # each as it is mounted
 
 
-def test_probes_that_look_the_same_way_have_no_radius() -> None:
+def test_nearly_parallel_probes_have_no_radius() -> None:
     probes = [channel("displacement", way, "DE", at) for way, at in (("X", 0), ("Y", 15))]
     assert level_plan(probes, 2000.0, (10.0, 1000.0)).pairs == ()
 
 
 @pytest.mark.parametrize("size", [1e-60, 1e-9, 1e60])
-def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size: float) -> None:
+def test_levels_keep_their_precision_at_any_size_of_vibration(size: float) -> None:
     t = times(5.0, 2000.0)
     theta = 2 * np.pi * 20 * t
     seen = np.column_stack([3 * np.cos(theta), 2 * np.sin(theta + 0.4)])
@@ -206,7 +206,7 @@ def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size:
     assert scaled.bands / size**2 == pytest.approx(one.bands, rel=1e-4, abs=1e-9)
 
 
-def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
+def test_levels_from_the_spectrum_of_the_moments_are_the_same() -> None:
     machine = load_machine("lab")
     plan = plan_for(machine, levels=True)
     rng = np.random.default_rng(20261126)
@@ -216,7 +216,7 @@ def test_levels_are_the_same_by_the_spectrum_that_the_moments_have() -> None:
     seen = gap + 1e-3 * (np.cos(theta)[:, None] + rng.standard_normal((plan.need, len(plan.states))))
     moments = sure(hop_moments(plan, np.column_stack([seen, theta % (2 * np.pi)]), 0.9 * gap, 0).levels)
     alone = hop_levels(sure(plan.levels), *waveform_of(seen[-plan.hop :]), theta[-plan.hop :])
-    alone.sums[CONTACT] = moments.sums[CONTACT]  # which only the moments look for
+    alone.sums[CONTACT] = moments.sums[CONTACT]  # which only the moments evaluate
     assert moments.sums == pytest.approx(alone.sums, rel=1e-3, abs=0, nan_ok=True)
     assert moments.bands == pytest.approx(alone.bands, rel=1e-4, abs=0)
     assert moments.orders[1:] == pytest.approx(alone.orders[1:], rel=1e-4, abs=1e-8)

@@ -1,4 +1,4 @@
-"""Run-out, as the vector that a probe shows at slow roll, is taken out of 1x: of its level and of the diagnosis."""
+"""Run-out, the vector of a probe at slow roll, is subtracted from 1x, in its level and in the diagnosis."""
 
 from functools import cache
 from typing import Any
@@ -53,7 +53,7 @@ def levels(machine: MachineFile, samples: FloatArray) -> tuple[WindowLevels, tup
 
 @pytest.mark.parametrize("turned", [1, -1])
 @pytest.mark.parametrize("lag_deg", [0.0, 30.0, 120.0, 250.0, 300.0])
-def test_the_vector_sum_of_a_run_out_and_a_vibration_gives_back_the_vibration(turned: int, lag_deg: float) -> None:
+def test_subtracting_the_slow_roll_vector_recovers_the_vibration(turned: int, lag_deg: float) -> None:
     machine = MachineFile.model_validate(PUMP)
     theta = turned * 2 * np.pi * 25 * np.arange(20 * 1024) / 1024
     both = at_1x(40, lag_deg, theta, turned) + at_1x(12, 250, theta, turned)
@@ -64,7 +64,7 @@ def test_the_vector_sum_of_a_run_out_and_a_vibration_gives_back_the_vibration(tu
     vector = 40 * np.exp(-1j * np.radians(lag_deg)) + 12 * np.exp(-1j * np.radians(250))
     assert y.x1 == pytest.approx(abs(vector) / 1000, rel=1e-3)  # no slow roll is given for it
     assert y.x1_phase_lag_deg == pytest.approx(-np.degrees(np.angle(vector)) % 360, abs=0.1)
-    # What is no vector at running speed is as it was measured, and so is what is left without it.
+    # All but the 1x vector is as measured, including the vibration without 1x.
     for measure in ("overall", "peak", "not_x1", "x2", "crest"):
         assert getattr(x, measure) == getattr(y, measure)
     assert x.not_x1 == pytest.approx(0.003 / np.sqrt(2), rel=0.01)
@@ -109,7 +109,7 @@ def test_the_unbalance_is_read_without_the_run_out() -> None:
     assert unbalance(with_slow_roll(machine), with_run_out(samples)) == pytest.approx(true, abs=1e-3)
 
 
-def test_sensors_are_judged_by_what_they_gave() -> None:
+def test_sensors_are_judged_without_run_out_compensation() -> None:
     machine, samples = simulated()
     compensated, measured = (statistics(one, with_run_out(samples)) for one in (with_slow_roll(machine), machine))
     assert measured.synchronous is not None
@@ -119,7 +119,7 @@ def test_sensors_are_judged_by_what_they_gave() -> None:
     assert sensor_findings(compensated, None, machine.sensors) == sensor_findings(measured, None, machine.sensors)
 
 
-def test_run_out_of_probes_at_an_angle_is_taken_out_as_they_are_mounted() -> None:
+def test_run_out_of_probes_at_an_angle_is_subtracted_as_mounted() -> None:
     machine, samples = simulated()
     angles: dict[str, dict[str, object]] = {
         "y1": {"angle_deg": 45.0, "direction": "X"},
@@ -132,7 +132,7 @@ def test_run_out_of_probes_at_an_angle_is_taken_out_as_they_are_mounted() -> Non
     assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_the_stream_is_the_same_with_and_without() -> None:
+def test_a_slow_roll_vector_does_not_change_the_stream() -> None:
     machine, _ = simulated()
     compensated = with_slow_roll(machine)
     assert compensated.descriptor == machine.descriptor
@@ -155,13 +155,13 @@ def test_the_stream_is_the_same_with_and_without() -> None:
         (RUNOUT | {"slow_roll_phase_lag_deg": 400.0}, "slow_roll_phase_lag_deg"),
     ],
 )
-def test_what_is_no_slow_roll_vector_is_refused(fields: dict[str, object], says: str) -> None:
+def test_invalid_slow_roll_vectors_are_refused(fields: dict[str, object], says: str) -> None:
     probe = {"name": "VE-1X", "direction": "X"} | PROBE | fields
     with pytest.raises(ValidationError, match=says):
         MachineFile.model_validate(PUMP | {"sensors": [probe, *PUMP["sensors"][1:]]})
 
 
-def test_without_a_phase_reference_there_is_nothing_to_take_a_vector_from() -> None:
+def test_a_slow_roll_vector_without_a_phase_reference_is_refused() -> None:
     says = "VE-1X has a slow-roll vector, and no sensor measures the shaft angle: without a phase reference"
     with pytest.raises(ValidationError, match=says):
         MachineFile.model_validate(PUMP | {"sensors": PUMP["sensors"][:2]})

@@ -1,4 +1,4 @@
-"""Excitation and response: the colouring filter, and the covariance that the Ljapunov equation gives."""
+"""Excitation and response: the colouring filter, and the covariance that the Lyapunov equation gives."""
 
 import numpy as np
 import pytest
@@ -153,8 +153,8 @@ def test_the_low_pass_is_a_butterworth(order: int) -> None:
 
 
 @pytest.mark.parametrize("source", [SHAPES["order 3"], SHAPES["hump"]], ids=["order 3", "hump"])
-def test_the_rotor_moves_as_the_spectrum_says(source: Source) -> None:
-    """Lyapunov variance of the displacements = integral of |H S|² over the force's spectrum, another way round."""
+def test_the_lyapunov_variance_equals_the_integral_of_the_spectrum(source: Source) -> None:
+    """Lyapunov variance of the displacements = integral of |H S|² over the force's spectrum."""
     machine = load_machine("heavy")  # damped enough for a plain sum over frequency
     rotor, speed = machine.rotor, machine.operation.speed_rad_s
     R = stationary_covariance(expanded_A(rotor, speed, (source,)), expanded_B((source,)))

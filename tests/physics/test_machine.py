@@ -47,7 +47,7 @@ def test_the_light_machine_is_damped_as_its_file_says() -> None:
     np.testing.assert_allclose(np.hypot(q1, q2)[[0, 1]], [2.04e-6, 12.4e-6], rtol=0.01)
 
 
-def test_changed_parameters() -> None:
+def test_parameters_are_changed_by_a_relative_amount() -> None:
     rotor = load_machine("lab").rotor
     for name in PARAMETERS:
         assert changed(rotor, {name: 0.1}) != rotor
@@ -73,25 +73,25 @@ unit = "g"
 
 
 def fan(folder: Path, *more: object, rate_hz: float = 25600.0) -> MachineFile:
-    """A machine of which nothing but its sensors is known, and what its file says besides."""
+    """A machine of which only the sensors are known, and what else its file says."""
     text = SENSORS_ALONE.replace("2000.0", repr(rate_hz))
     return load_machine_file(write(folder, "\n".join([text, *map(str, more)]) + "\n"))
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 200.0, 256.0, 1666.67, 6400.5, 51200 / 7, 51200 / 3, 102400.0])
-def test_a_machine_file_with_nothing_but_sensors_goes_with_any_rate(tmp_path: Path, rate_hz: float) -> None:
+def test_a_machine_file_with_only_sensors_works_at_any_rate(tmp_path: Path, rate_hz: float) -> None:
     window = fan(tmp_path, rate_hz=rate_hz).window
     assert (window.segment_s, window.hop_s, window.length_s) == pytest.approx((2, 5, 60), rel=0.01)
     assert window.band_hz[0] == 3.0
     assert window.band_hz[1] < rate_hz / 2
 
 
-def test_the_mark_that_windows_editors_begin_a_file_with_is_no_mistake(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     assert load_machine_file(write(tmp_path, "\ufeff" + SENSORS_ALONE)).name == "fan"
 
 
 def in_time(times: float, rate_hz: float, *more: str) -> str:
-    """The rotor kit as a machine that moves so many times as fast, its file without a window of its own."""
+    """The file of the rotor kit as a machine that moves `times` as fast, without a window."""
     text = LAB[: LAB.index("[window]")] + LAB[LAB.index("[alarms]") :]
     factors = {"k_by_N_per_m": times**2, "k_bz_N_per_m": times**2, "c_by_N_s_per_m": times, "c_bz_N_s_per_m": times}
     for name, factor in (factors | {"shaft_diameter_m": times**0.5, "speed_rpm": times}).items():
@@ -107,7 +107,7 @@ def kit(folder: Path, times: float, rate_hz: float, *more: str) -> Machine:
     return load_machine(write(folder, in_time(times, rate_hz, *more)))
 
 
-def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: Path) -> None:
+def test_the_default_window_follows_from_the_natural_frequencies(tmp_path: Path) -> None:
     usual = kit(tmp_path, 1, 2000.0)
     assert (usual.window, usual.time_scale) == (WindowSettings(), 1)
 
@@ -128,7 +128,7 @@ def test_a_window_that_is_not_given_goes_with_the_natural_frequencies(tmp_path: 
     assert slow.window.hop_s % (slow.window.segment_s / 2) == pytest.approx(0)
 
 
-def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
+def test_a_given_window_is_used(tmp_path: Path) -> None:
     lengths = ("hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05")
     given = kit(tmp_path, 15, 20000.0, "[window]", *lengths)
     assert (given.window.hop_s, given.window.length_s, given.window.segment_s) == (10, 120, 2)
@@ -137,25 +137,25 @@ def test_a_window_that_is_given_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("given", ["hop_s = 1.0", "segment_s = 1.0", "max_span_s = 120.0"])
-def test_a_slow_machine_whose_file_gives_one_length_has_the_usual_others(tmp_path: Path, given: str) -> None:
-    """Longer lags would not go into a hop that is given, nor a longer window into a span that is."""
+def test_a_slow_machine_with_one_given_length_has_the_usual_others(tmp_path: Path, given: str) -> None:
+    """Longer lags would not fit into a given hop, nor a longer window into a given span."""
     window = kit(tmp_path, 0.01, 200.0, "[window]", given).window
     usual = WindowSettings()
     assert (window.length_s, window.lag_to_s) == (usual.length_s, usual.lag_to_s)
 
 
 @pytest.mark.parametrize("lag_to_s", [0.1, 0.125])
-def test_given_lags_of_a_usual_machine_are_what_a_fast_one_is_evaluated_by(tmp_path: Path, lag_to_s: float) -> None:
-    """What was commissioned with such a file before goes on as it was."""
+def test_a_fast_machine_with_the_usual_lags_given_has_time_scale_one(tmp_path: Path, lag_to_s: float) -> None:
+    """Earlier commissionings with such a file keep their evaluation."""
     speed = "[operation]\nspeed_rpm = 6000"
     assert fan(tmp_path, speed).time_scale == 0.5
     assert fan(tmp_path, speed, "[window]\nlag_from_s = 0.01", f"lag_to_s = {lag_to_s}").time_scale == 1
 
 
-def test_the_usual_window_is_near_enough_for_a_machine_a_little_off() -> None:
+def test_machines_slightly_out_of_the_usual_range_keep_time_scale_one() -> None:
     assert [time_scale((), rpm / 60) for rpm in (3600, 3750, 4200)] == [1, 1, 0.71]
     assert [time_scale((low, low, 80.0, 80.0), None) for low in (6.0, 5.0, 4.0)] == [1, 1, 1.5]
-    # As slow as the slowest motion, as far as the fastest lets it.
+    # As slow as the slowest motion needs, as far as the fastest allows.
     assert [time_scale((0.5, 0.5, high, high), None) for high in (8.0, 40.0, 100.0, 120.0)] == [12, 3, 1, 1]
 
 
@@ -170,13 +170,13 @@ def test_a_rotor_without_natural_frequencies_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_mean_is_no_part_of_the_band(tmp_path: Path) -> None:
-    """Snapshots of a slow machine may be too short for segments that tell its slowest motion from rest."""
+    """Snapshots of a slow machine may be too short for segments that resolve its slowest motion."""
     machine = kit(tmp_path, 0.05, 200.0, "[schedule]", "on_s = 2.0", "every_s = 60.0")
     assert round(machine.window.band_hz[0] * machine.window.segment_s) == 0
     assert plan_for(machine).bins[0] == 1
 
 
-def test_where_the_rotor_is_not_known_a_fast_speed_says_so_and_a_slow_one_nothing(tmp_path: Path) -> None:
+def test_without_a_known_rotor_only_a_fast_speed_changes_the_time_scale(tmp_path: Path) -> None:
     windows = {rpm: fan(tmp_path, f"[operation]\nspeed_rpm = {rpm}") for rpm in (60, 1500, 3000, 15000)}
     assert [one.time_scale for one in windows.values()] == [1, 1, 1, 0.2]
     assert (windows[60].window, windows[15000].window.band_hz) == (windows[3000].window, (15, 750))
@@ -191,8 +191,6 @@ def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("rpm", "rate_hz"), [(15000, 60.0), (60000, 100.0), (60000, 50.0)])
-def test_a_rate_that_shows_nothing_of_a_fast_machine_still_goes_with_the_usual_window(
-    tmp_path: Path, rpm: int, rate_hz: float
-) -> None:
+def test_a_rate_too_low_for_a_fast_machine_leaves_the_usual_window(tmp_path: Path, rpm: int, rate_hz: float) -> None:
     machine, usual = (fan(tmp_path, f"[operation]\nspeed_rpm = {one}", rate_hz=rate_hz) for one in (rpm, 1500))
     assert (machine.window, machine.time_scale) == (usual.window, 1)

@@ -1,6 +1,6 @@
-"""What a version of the monitor said, kept: every later one says the same, or gives its reason for not doing so.
+"""Stored output of the monitor: every later version gives the same, or states a reason for the difference.
 
-``ROTORWATCH_PIN=1`` in the environment of a test that compares makes it write what it finds.
+With ``ROTORWATCH_PIN=1`` in its environment, a test that compares stores what it finds.
 """
 
 import gzip
@@ -18,11 +18,11 @@ _NEAR, _NEAR_ZERO = 1e-3, 1e-6
 relative change by some 1e-8 and a ``z``, which is one over its error, by some 1e-5.
 """
 _COARSE = {"z": 1e-3, "deg": 1e-3}
-"""What lies around zero by nature, by the end of its name, and how far it may lie off."""
+"""Absolute tolerances of values around zero, by the last part of their name."""
 
 
 def differences(name: str, lines: Sequence[str]) -> list[str]:
-    """Where JSON lines are not what was kept under a name; floats may be other in their fourth digit."""
+    """Where JSON lines differ from those stored under a name; floats may differ in their fourth digit."""
     path = _FOLDER / f"{name}.jsonl.gz"
     if os.environ.get("ROTORWATCH_PIN"):
         path.write_bytes(gzip.compress("".join(f"{line}\n" for line in lines).encode(), mtime=0))
@@ -38,7 +38,7 @@ def differences(name: str, lines: Sequence[str]) -> list[str]:
 
 def _between(old: Any, new: Any, where: str) -> list[str]:
     if isinstance(old, dict) and isinstance(new, dict) and list(old) == list(new):
-        # What a bundle is called by is made of every bit of it.
+        # The identity of a bundle depends on its every bit.
         keys = [key for key in old if key != "bundle"]
         return [found for key in keys for found in _between(old[key], new[key], f"{where}.{key}")]
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):

@@ -1,4 +1,4 @@
-"""Five scenarios are reported as they were, by the commands: from a simulated recording to lines of JSON."""
+"""The commands report five scenarios as before, from a simulated recording to lines of JSON."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ CHANGES = ("healthy", "k_by=-0.25", "e=0.5", *FURTHER)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_scenario_is_reported_as_it_was(change: str, tmp_path: Path) -> None:
+def test_a_scenario_is_reported_as_pinned(change: str, tmp_path: Path) -> None:
     name = change.partition("=")[0]
     fault = () if change == "healthy" else ("--fault", f"{change}@62")
     recording, lines = tmp_path / "stream.mcap", tmp_path / "lines.jsonl"

@@ -29,7 +29,7 @@ def told(blocks: Iterable[SampleBlock]) -> list[tuple[int, int, int]]:
 
 
 def ordered(stream: Iterable[SampleBlock], bound: int = BOUND, arrivals: Arrivals | None = None) -> list[SampleBlock]:
-    """What goes on to the gate, with the end of the stream."""
+    """Blocks that are passed on to the gate, up to the end of the stream."""
     arrivals = Arrivals(bound) if arrivals is None else arrivals
     found = []
     for one in stream:
@@ -89,7 +89,7 @@ def test_reordering_and_repetition_change_nothing(late: list[int], again: list[t
 @pytest.mark.slow
 @settings(max_examples=60)
 @given(lateness(N), repetitions, st.sets(st.integers(1, N - 1), max_size=12))
-def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
+def test_missing_blocks_lose_no_other_blocks(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
     whole = [block(number) for number in range(N)]
     stream = [one for one in whole if one.sequence not in lost]
     arriving = [one for one in delivered(whole, late, again) if one.sequence not in lost]
@@ -102,10 +102,10 @@ def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tup
     lateness(3 * N), repetitions, st.sampled_from([-3600, -50, -2, 0, 2, 900, 7200]), st.integers(-20, 400),
     st.booleans(),
 )  # fmt: skip
-def test_a_clock_that_is_set_and_a_restart_change_nothing(
+def test_a_clock_step_and_a_restart_change_nothing(
     late: list[int], again: list[tuple[int, int]], clock_s: int, pause: int, has_run: bool
 ) -> None:
-    """As without arrivals, and repetitions of blocks from before are still repetitions."""
+    """The gate accepts the same, and repetitions of earlier blocks are still repetitions."""
     run = 2 if has_run else 1
     first = [block(number) for number in range(N)]
     second = [block(number, shift_ns=clock_s * 10**9) for number in range(N, 2 * N)]
@@ -144,7 +144,7 @@ def test_any_block_may_be_repeated_anywhere() -> None:
 @settings(max_examples=100)
 @given(lateness(N), repetitions, st.lists(st.integers(0, N), max_size=3))
 def test_restarts_of_a_monitor_change_nothing(late: list[int], again: list[tuple[int, int]], stops: list[int]) -> None:
-    """What waited is lost with the monitor and comes again, with much else, from the publisher's cache."""
+    """Waiting blocks are lost with the monitor and come again, with many others, from the publisher's cache."""
     stream = [block(number) for number in range(N)]
     arriving = delivered(stream, late, again)
     gate, arrivals = Gate(MACHINE), Arrivals(BOUND)
@@ -170,7 +170,7 @@ def test_restarts_of_a_monitor_change_nothing(late: list[int], again: list[tuple
     ),
     st.integers(0, 4),
 )
-def test_whatever_comes_goes_on_and_memory_is_bounded(coming: list[tuple[int, int, int, int]], bound: int) -> None:
+def test_every_block_is_passed_on_and_memory_is_bounded(coming: list[tuple[int, int, int, int]], bound: int) -> None:
     stream = [
         block(number, sequence=number + far, run=run, shift_ns=wrong * STEP_NS) for number, run, wrong, far in coming
     ]
@@ -181,14 +181,14 @@ def test_whatever_comes_goes_on_and_memory_is_bounded(coming: list[tuple[int, in
         held = {id(each) for copies in arrivals._waiting.values() for each in copies}
         assert len(held) <= bound
     gone_on += [arrived.block for arrived in arrivals.flush()]
-    # Every block goes on, as often as it came; beyond `bound` copies of one that waits nobody counts.
+    # Every block is passed on; beyond `bound`, copies of a waiting block may be dropped.
     assert set(told(gone_on)) == set(told(stream))
     assert len(gone_on) <= len(stream)
     if bound == 0:
         assert gone_on == stream
 
 
-def test_a_hole_is_waited_for_and_given_up_at_the_bound() -> None:
+def test_a_missing_block_is_awaited_and_given_up_at_the_bound() -> None:
     arrivals = Arrivals(3)
 
     def took(number: int) -> list[int]:
@@ -218,14 +218,14 @@ def test_repetitions_of_a_waiting_block_follow_it() -> None:
     assert refused([block(0), *gone_on]) == [Reason.OVERLAP] * 3
 
 
-def test_a_stream_that_is_joined_late_begins_at_once_and_a_young_one_waits_for_its_beginning() -> None:
+def test_a_stream_joined_late_begins_at_once_and_a_new_one_awaits_its_first_block() -> None:
     late, young = Arrivals(3), Arrivals(3)
     assert len(late.take(block(36_000))) == 1
     assert young.take(block(2)) == young.take(block(1)) == ()
     assert [arrived.block.sequence for arrived in young.take(block(0))] == [0, 1, 2]
 
 
-def test_another_run_ends_the_waiting_of_the_one_before() -> None:
+def test_a_new_run_ends_the_waiting_of_the_previous_run() -> None:
     arrivals = Arrivals(3)
     for number in (0, 2):
         arrivals.take(block(number))
@@ -236,7 +236,7 @@ def test_another_run_ends_the_waiting_of_the_one_before() -> None:
     assert arrivals.waiting == 1
 
 
-def test_blocks_of_odd_form_keep_their_place() -> None:
+def test_malformed_blocks_keep_their_place() -> None:
     broken = replace(block(2), samples=np.full((LENGTH, 9), np.nan, np.float32))
     narrow = replace(block(3), samples=np.zeros((LENGTH, 2), np.float32))
     arriving = [block(0), narrow, block(4), broken, broken, block(1)]
@@ -245,7 +245,7 @@ def test_blocks_of_odd_form_keep_their_place() -> None:
     assert refused(gone_on) == [Reason.NOT_FINITE] * 2 + [Reason.CHANNELS]
 
 
-def test_a_restored_gate_says_what_is_expected() -> None:
+def test_arrivals_resume_at_the_block_that_a_restored_gate_expects() -> None:
     arrivals = Arrivals(3)
     arrivals.resume((Course(1, 0, -(2**63), 7, 2**63),))
     assert len(arrivals.take(block(3))) == 1  # there already

@@ -1,4 +1,4 @@
-"""A shaft angle that jumps, and one that changes its speed; that of ``docs/wire.md`` serves as the true one."""
+"""Jumps and speed changes of a shaft angle; the angle that ``docs/wire.md`` makes is as good as the true one."""
 
 import math
 from typing import Any
@@ -30,7 +30,7 @@ def jump_within_a_turn(angle_rad: FloatArray) -> float:
 
 
 def pulses_elsewhere(by_rad: float) -> FloatArray:
-    """An angle between pulses, one a turn, whose mark has moved: one turn is longer or shorter than the others."""
+    """An angle from pulses, one per turn, whose mark has moved: one turn is longer or shorter than the others."""
     pulses_s = np.arange(200) * 2 * np.pi / SPEED_RAD_S
     pulses_s[80:] -= by_rad / SPEED_RAD_S
     return np.asarray(np.mod(2 * np.pi * np.interp(np.arange(N) / RATE_HZ, pulses_s, np.arange(200)), 2 * np.pi))
@@ -44,7 +44,7 @@ def test_a_jump_is_seen_between_samples_and_between_pulses(by_rad: float) -> Non
     assert jump_within_a_turn(pulses_elsewhere(by_rad)) == pytest.approx(by_rad, abs=0.02)
 
 
-def test_no_speed_makes_a_jump() -> None:
+def test_a_changing_speed_is_no_jump() -> None:
     t_s = np.arange(N) / RATE_HZ
     up, down = (np.where(t_s < 3, 1.0, to) for to in (1.2, 0.8))
     for speed in (up, down, 1 + 0.02 * np.sin(2 * np.pi * t_s / 4), t_s / t_s[-1]):
@@ -73,7 +73,7 @@ def voltage(theta: FloatArray, rate_hz: float, edge_s: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(("edge_s", "most_deg"), [(1e-3, 1.0), (1e-5, 6.0)])
-def test_an_angle_from_pulses_serves_as_the_true_one(edge_s: float, most_deg: float) -> None:
+def test_an_angle_from_pulses_is_as_good_as_the_true_one(edge_s: float, most_deg: float) -> None:
     machine = load_machine("lab").model_copy(update={"dtype": "float64"})
     wandering = [
         Event(at_s=at, speed_rpm=machine.operation.speed_rpm * (1 + 0.02 * math.sin(at / 10))) for at in range(1, 65)

@@ -1,4 +1,4 @@
-"""Settings of a link: what contradicts, what is secret, and what is said when something cannot be used; who sends."""
+"""Settings of a link: contradictions, secrets and error messages; conflicts between publishers."""
 
 import json
 from dataclasses import replace
@@ -88,12 +88,12 @@ def inserted(link: LinkSettings) -> zenoh.Config:
         ({"grants": [{"who": ["lab"], "reads": ["demo/*"]}]}, "Extra inputs"),
     ],
 )
-def test_what_contradicts_is_said(fields: dict[str, Any], said: str) -> None:
+def test_contradictory_settings_are_named(fields: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         LinkSettings.model_validate(fields)
 
 
-def test_contradictions_that_a_command_line_brings_are_found_at_opening(tmp_path: Path) -> None:
+def test_contradictions_from_the_command_line_are_found_on_opening(tmp_path: Path) -> None:
     link = LinkSettings(listen=ENDPOINT).model_copy(update={"listen": (), "connect": TLS_ENDPOINT})
     with pytest.raises(MachineFileError, match=r"^link: connect is tls/127.0.0.1:7447: expected \[link.tls\]"):
         link.zenoh_items()
@@ -108,7 +108,7 @@ def test_a_password_in_the_settings_is_refused_and_not_repeated(tmp_path: Path, 
     assert HIDDEN not in f"{caught.value} {caught.value.__cause__}"
 
 
-def test_secrets_are_in_what_goes_to_zenoh_and_nowhere_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_secrets_go_to_zenoh_and_nowhere_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LAB_PASSWORD", HIDDEN)
     by_variable = LinkSettings.model_validate(BY_VARIABLE)
     secret_file(tmp_path / "p", f"{HIDDEN}\n")
@@ -128,7 +128,7 @@ def test_a_missing_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o604, 0o644, 0o602, 0o777])
-def test_secrets_that_everybody_may_read_are_refused(tmp_path: Path, mode: int) -> None:
+def test_world_accessible_secrets_are_refused(tmp_path: Path, mode: int) -> None:
     password = secret_file(tmp_path / "p", HIDDEN, mode)
     passwords = secret_file(tmp_path / "all", f"lab:{HIDDEN}", mode)
     tls = certificate(tmp_path)
@@ -162,7 +162,7 @@ PASSWORD = {"connect": ENDPOINT, "user": "lab", "password_file": "all"}
         (PASSWORD, "", "found 0 lines"), (PASSWORD, f"{HIDDEN}\n{HIDDEN}\n", "found 2 lines"),
     ],
 )  # fmt: skip
-def test_a_file_of_passwords_that_is_none_is_refused_and_not_shown(
+def test_an_invalid_passwords_file_is_refused_without_showing_it(
     tmp_path: Path, fields: dict[str, Any], text: str, said: str
 ) -> None:
     passwords = secret_file(tmp_path / "all", text)
@@ -217,7 +217,7 @@ def test_a_certificate_serves_the_role_of_the_endpoint(tmp_path: Path) -> None:
         assert found["verify_name_on_connect"] is True
 
 
-def test_refusals_name_every_reason_the_settings_leave_open(tmp_path: Path) -> None:
+def test_connection_errors_name_every_reason_that_the_settings_leave_open(tmp_path: Path) -> None:
     error = "Unable to connect to any of [tcp/127.0.0.1:7447]. Timeout! at /x/orchestrator.rs:388."
     plain = LinkSettings(connect=ENDPOINT).explain(error)
     assert plain.startswith("nothing answers there; or ")
@@ -234,7 +234,7 @@ def test_refusals_name_every_reason_the_settings_leave_open(tmp_path: Path) -> N
 
 
 def allowed(control: dict[str, Any], name: str, flow: str, message: str, key: str) -> bool:
-    """Zenoh's decision, made again from the configuration: some rule of the subject includes the key."""
+    """Zenoh's decision, reproduced from the configuration: some rule of the subject includes the key."""
     policies = [policy for policy in control["policies"] if name in policy["subjects"]]
     names = {rule for policy in policies for rule in policy["rules"]}
     return any(
@@ -253,7 +253,7 @@ _PLACES = st.sampled_from(["demo/lab", "demo/pump", "demo/*", "plant/lab", "*/la
 
 
 @given(publishes=st.lists(_PLACES), views=st.lists(_PLACES), monitors=st.lists(_PLACES))
-def test_nobody_sends_what_no_grant_allows(publishes: list[str], views: list[str], monitors: list[str]) -> None:
+def test_access_control_allows_only_granted_keys(publishes: list[str], views: list[str], monitors: list[str]) -> None:
     if not (publishes or views or monitors):
         return
     fields = {"who": ["lab"], "publishes": publishes, "views": views, "monitors": monitors}
@@ -318,7 +318,7 @@ def block(sequence: int, run: int = 1, start_s: float = 0.0, value: float = 0.0)
     return SampleBlock(round((start_s + sequence) * S), sequence, run, 10.0, samples)
 
 
-def test_one_publisher_with_repetitions_and_reordering_contradicts_nobody() -> None:
+def test_one_publisher_with_repetition_and_reordering_is_no_conflict() -> None:
     senders = Senders()
     rng = np.random.default_rng(1)
     order = np.argsort(np.arange(400) + rng.uniform(0, 8, 400))
@@ -327,7 +327,7 @@ def test_one_publisher_with_repetitions_and_reordering_contradicts_nobody() -> N
     assert senders.conflict == ""
 
 
-def test_restarts_contradict_nobody() -> None:
+def test_restarts_are_no_conflict() -> None:
     senders = Senders()
     for run in range(1, 30):
         late = [block(20 + n, run - 1, start_s=100 * (run - 1)) for n in range(4)] if run > 1 else []
@@ -338,7 +338,7 @@ def test_restarts_contradict_nobody() -> None:
     assert senders.conflict == ""
 
 
-def test_a_count_that_begins_anew_is_no_other_version() -> None:
+def test_restarted_sequence_numbers_are_no_conflict() -> None:
     senders = Senders()
     for start_s in (0.0, 50.0, 300.0):
         for n in range(20):
@@ -368,12 +368,12 @@ def test_a_slow_second_publisher_is_noticed_too() -> None:
     assert "both send" in senders.conflict
 
 
-def test_of_a_block_in_two_versions_neither_is_believed() -> None:
+def test_neither_of_two_versions_of_a_block_is_accepted() -> None:
     senders = Senders()
     for n in range(10):
         assert not senders.take(block(n))
     forged = replace(block(12), samples=block(12).samples + 1)
-    assert not senders.take(forged)  # nobody knows yet
+    assert not senders.take(forged)  # not yet known
     assert not senders.take(block(10))
     assert not senders.take(block(11))
     assert senders.take(block(12))

@@ -42,7 +42,7 @@ def _write(folder: Path, content: list[RecordedMessage]) -> Path:
 
 @settings(max_examples=40)
 @given(content=st.lists(messages, max_size=30))
-def test_messages_come_back_the_same(tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]) -> None:
+def test_messages_survive_unchanged(tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]) -> None:
     path = _write(tmp_path_factory.mktemp("recording"), content)
     assert list(read_recording(path)) == content
     summary = summarize_recording(path)
@@ -52,7 +52,7 @@ def test_messages_come_back_the_same(tmp_path_factory: pytest.TempPathFactory, c
         assert (summary.start_ns, summary.end_ns) == (min(times), max(times))
 
 
-def test_a_first_time_and_keys_can_be_chosen(tmp_path: Path) -> None:
+def test_reading_can_be_limited_to_a_start_time_and_keys(tmp_path: Path) -> None:
     truth = RecordedMessage("m/truth", b"{}", b"", "application/json", 150_000, 150_000)
     content = [*_some(150), truth, *_some(400)[150:]]
     path = _write(tmp_path, content)
@@ -82,7 +82,7 @@ def test_the_name_appears_when_the_recording_is_complete(tmp_path: Path) -> None
         assert (tmp_path / "run.mcap.part").exists()
     assert path.exists()
     assert not (tmp_path / "run.mcap.part").exists()
-    writer.close()  # once more does nothing
+    writer.close()  # a second close does nothing
     assert list(read_recording(path)) == _some(1)
 
 
@@ -109,7 +109,7 @@ def test_an_existing_recording_is_kept_unless_asked(tmp_path: Path) -> None:
     assert list(read_recording(path)) == []
 
 
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+def test_unreadable_and_unwritable_paths_are_named(tmp_path: Path) -> None:
     for read in (lambda path: list(read_recording(path)), summarize_recording):
         with pytest.raises(RecordingError, match=r"none\.mcap: cannot be read \(No such file"):
             read(tmp_path / "none.mcap")
@@ -156,7 +156,7 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
     assert list(read_recording(new)) == content[:count]
 
 
-def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> None:
+def test_the_part_left_by_a_crash_is_kept_and_recovered_to_its_name(tmp_path: Path) -> None:
     path = _write(tmp_path, _some(400))
     part = path.rename(tmp_path / "run.mcap.part")
     part.write_bytes(part.read_bytes()[:-1000])
@@ -172,7 +172,7 @@ def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> 
 
 
 def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
-    """Without a write more, without closing: what a killed process leaves behind."""
+    """Without another write or closing, as a killed process leaves it."""
     part, new = tmp_path / "run.mcap.part", tmp_path / "new.mcap"
     still = RecordedMessage("m/stream", bytes(7200), bytes(32), "x;1", 1, 1)  # compresses to less than a file buffer
     content = [still] * 100
@@ -187,7 +187,7 @@ def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
     assert list(read_recording(new)) == content[:count]
 
 
-def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
+def test_a_damaged_chunk_is_skipped_and_counted(tmp_path: Path) -> None:
     content = _some(400)
     path, new = _write(tmp_path, content), tmp_path / "new.mcap"
     whole = inspect_recording(path)
@@ -208,7 +208,7 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
     assert 200_000 < salvage.lost_bytes < 300_000
 
 
-def test_the_chunk_that_names_the_keys_may_be_the_damaged_one(tmp_path: Path) -> None:
+def test_the_chunk_that_names_the_keys_may_be_damaged(tmp_path: Path) -> None:
     content = _some(400)
     path = _write(tmp_path, content)
     data = bytearray(path.read_bytes())
@@ -225,7 +225,7 @@ def test_the_chunk_that_names_the_keys_may_be_the_damaged_one(tmp_path: Path) ->
 
 @settings(max_examples=60)
 @given(place=st.floats(0, 1), keep=st.floats(0, 1), flips=st.integers(0, 3))
-def test_whatever_the_damage_what_comes_back_was_written(
+def test_recovered_messages_were_written_whatever_the_damage(
     tmp_path_factory: pytest.TempPathFactory, place: float, keep: float, flips: int
 ) -> None:
     folder = tmp_path_factory.mktemp("damage")

@@ -1,6 +1,6 @@
 """Channels, keys, and the wire format: round trips, every refusal, and the page that describes it (``docs/wire.md``).
 
-The examples of the page run here, so that it cannot lie.
+The examples of the page run here, which keeps them correct.
 """
 
 import ctypes
@@ -383,7 +383,7 @@ def test_a_name_or_a_quantity_occurs_once() -> None:
         _descriptor(_channel(), _channel(name="XE-2"))
 
 
-def test_the_hash_changes_with_whatever_shapes_the_stream() -> None:
+def test_the_schema_hash_changes_with_everything_that_shapes_the_stream() -> None:
     y, z = _channel(), _channel(name="XE-2", direction="z")
     variants = [
         _descriptor(y, z), _descriptor(z, y), _descriptor(y), _descriptor({**y, "unit": "mm"}, z),
@@ -394,7 +394,7 @@ def test_the_hash_changes_with_whatever_shapes_the_stream() -> None:
     assert (again.schema_hash, again.states) == (variants[0].schema_hash, ("y1", "z1"))
 
 
-def test_keys_lie_below_the_machine() -> None:
+def test_all_keys_begin_with_the_machine() -> None:
     keys = MachineKeys("plant-2", "Pump_7")
     names = (
         keys.stream, keys.descriptor, keys.truth, keys.report, keys.health, keys.alarm_event, keys.alarm_state,

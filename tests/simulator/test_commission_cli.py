@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_is_commissioned_again_only_with_a_reason(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
     variables = {**os.environ, "COLUMNS": "200"}
     found = ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
@@ -83,7 +83,7 @@ def test_a_machine_is_commissioned_and_again_only_with_a_reason(folder: Path, mo
     ("of", "damaged", "why"),
     [("heavy", False, "trained for another machine"), ("lab", True, "weights.safetensors"), ("lab", False, "")],
 )
-def test_networks_that_cannot_be_used_do_not_stay_beside_a_new_commissioning(
+def test_unusable_networks_are_removed_by_a_new_commissioning(
     folder: Path, of: str, damaged: bool, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
@@ -123,7 +123,7 @@ def test_an_unfit_recording_is_refused_with_what_to_record(folder: Path, monkeyp
     assert report["identity"] is None
 
 
-def test_recordings_and_machine_files_that_cannot_be_used(folder: Path) -> None:
+def test_unusable_recordings_and_machine_files_are_refused(folder: Path) -> None:
     (folder / "other.toml").write_text(NOTHING_KNOWN.replace('name = "lab"', 'name = "pump"', 1), encoding="utf-8")
     found = run(folder, "--machine", "other.toml", "--healthy", "monday.mcap", "--out", "never")
     assert found.exit_code == 2
@@ -163,7 +163,7 @@ def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
         ("commission", "--machine", "lab", "--healthy", "healthy.mcap", "--out", "bundle"),
     ],
 )
-def test_what_needs_training_says_what_to_install(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_commands_with_missing_packages_say_what_to_install(command: tuple[str, ...], tmp_path: Path) -> None:
     """As after an installation without extras, where there is no torch."""
     (tmp_path / "healthy.mcap").touch()
     code = (

@@ -1,4 +1,4 @@
-"""The report of a commissioning: what people read says what was found, for real recordings at every level."""
+"""The report of a commissioning, on the page and in the terminal, for recordings at every knowledge level."""
 
 import json
 import re
@@ -93,7 +93,7 @@ class Page(HTMLParser):
 
     @property
     def text(self) -> str:
-        """What a reader sees, white space apart."""
+        """The visible text, with white space collapsed."""
         return " ".join(" ".join(self.texts).split())
 
 
@@ -109,7 +109,7 @@ MADE_OF: dict[str, Callable[[], tuple[MachineFile, tuple[HealthyRecording, ...]]
     "full": lambda: (LAB, (healthy(LAB, 70.0, 64),)),
     "partial": lambda: (PARTIAL, (healthy(PARTIAL, 70.0, 66, RUDE),)),
     "none": lambda: (NOTHING, (healthy(NOTHING, 70.0, 67), healthy(NOTHING, 40.0, 68, RUDE))),
-    # Of which all is known, but for what its sensors are to do with it.
+    # All is known of the machine, but its sensors measure no modelled motion.
     "casing": lambda: (elsewhere(LAB), (healthy(elsewhere(LAB), 70.0, 60105),)),
     "too short": lambda: (NOTHING, (healthy(NOTHING, 30.0, 69),)),
     "no hop": lambda: (NOTHING, (healthy(NOTHING, 3.0, 70),)),
@@ -129,7 +129,7 @@ LEVELS = ("full", "partial", "none")
 REFUSED = ("too short", "no hop", "second excitation", "no speed")
 CASES = tuple(MADE_OF)
 DRAWN = ("none", "no speed", "casing")
-"""Cases whose pictures become SVG, which takes seconds; those of the others are painted and no more."""
+"""Cases whose pictures become SVG, which takes seconds; those of the others are only painted."""
 
 
 def painted(_: str, label: str, paint: Callable[[], Figure | None]) -> Markup | None:
@@ -142,7 +142,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def written(folder: Path, name: str) -> tuple[str, CommissioningReport]:
-    """Text of the page of a case and what its JSON holds."""
+    """Text of the page of a case, and the report in its JSON file."""
     place = folder / name.replace(" ", "-")
     if not (place / HTML).exists():
         made, recordings, machine = case(name)
@@ -165,7 +165,7 @@ def squeezed(text: str) -> str:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_page_is_whole_and_needs_nothing_else(folder: Path, name: str) -> None:
+def test_a_page_is_well_formed_and_self_contained(folder: Path, name: str) -> None:
     text, _ = written(folder, name)
     page = Page(text)
     assert text.startswith("<!doctype html>")
@@ -190,7 +190,7 @@ def printed(report: CommissioningReport, width: int = 80) -> str:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_verdict_checks_and_equations_are_all_there_in_json_and_in_80_columns(folder: Path, name: str) -> None:
+def test_verdict_checks_and_equations_are_complete_in_page_json_and_80_columns(folder: Path, name: str) -> None:
     text, report = written(folder, name)
     verdict, checks = section(text, "verdict"), section(text, "checks")
     assert squeezed(headline(report)) in verdict
@@ -225,7 +225,7 @@ def test_verdict_checks_and_equations_are_all_there_in_json_and_in_80_columns(fo
 
 
 @pytest.mark.parametrize("name", [*LEVELS, "no phase reference"])
-def test_figures_of_the_table_are_those_of_the_report(folder: Path, name: str) -> None:
+def test_the_table_shows_the_figures_of_the_report(folder: Path, name: str) -> None:
     text, report = written(folder, name)
     rows = Page(text).rows
     assert len(report.parameters) == 6
@@ -256,7 +256,7 @@ def _words(one: ParameterSummary) -> Iterator[str]:
             yield duration(seconds)
 
 
-def test_what_a_reader_is_told_at_each_level(folder: Path) -> None:
+def test_the_page_explains_readings_at_each_knowledge_level(folder: Path) -> None:
     full, partial, none = (section(written(folder, name)[0], "parameters") for name in LEVELS)
     assert "taken as exact" in full
     assert "identified" not in full
@@ -285,7 +285,7 @@ def test_a_refusal_says_why_and_what_to_record_instead(folder: Path, name: str) 
     assert "--machine FILE@BUNDLE" not in text
 
 
-def test_a_machine_of_whose_motion_nothing_is_measured_is_said_to_be_compared_by_its_levels(folder: Path) -> None:
+def test_a_machine_without_measured_motion_is_compared_by_its_levels(folder: Path) -> None:
     text, report = written(folder, "casing")
     assert report.verdict == "limited"
     told = "the vibration levels of its channels are compared with those of the healthy recordings"
@@ -296,7 +296,7 @@ def test_a_machine_of_whose_motion_nothing_is_measured_is_said_to_be_compared_by
     assert {one.channel for one in report.levels} == {one.name for one in LAB.sensors if one.name != "theta"}
 
 
-def test_nothing_of_names_and_descriptions_reaches_the_page_as_markup(folder: Path, tmp_path: Path) -> None:
+def test_names_and_descriptions_are_escaped_on_the_page(folder: Path, tmp_path: Path) -> None:
     for name in ("partial", "none", "second excitation"):
         text, _ = written(folder, name)
         assert "<script" not in text
@@ -315,7 +315,7 @@ def pictures(text: str) -> dict[str, str]:
     return {title: Page(caption).text for title, _, caption in found}
 
 
-def test_pictures(folder: Path) -> None:
+def test_each_page_has_its_pictures_and_captions(folder: Path) -> None:
     everything = [
         "Healthy readings", "What limits each reading", "Spectra of the recordings", "Speed and level over time",
     ]  # fmt: skip
@@ -346,7 +346,7 @@ def test_pictures_take_the_colours_of_the_page(folder: Path) -> None:
         assert not re.search(r"(?:fill|stroke): (?:#0{6}|#f{6}|black|white)\b", drawing)
 
 
-def test_recordings_and_conditions(folder: Path) -> None:
+def test_recordings_and_commissioned_conditions_are_on_the_page(folder: Path) -> None:
     text, report = written(folder, "none")
     seen = section(text, "recordings")
     assert "1 healthy.mcap 000000000000 2026-01-01 00:00:02 65 s none none 1320 rpm" in seen
@@ -387,7 +387,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         write_report(tmp_path / "taken", made.report, recordings)
 
 
-def test_which_error_is_said_to_dominate() -> None:
+def test_the_dominant_error_follows_from_the_ratio_of_errors() -> None:
     one = next(each for each in case("partial")[0].report.parameters if each.name == "k_by")
     own = sure(one.window_error)
     shares = {0.0: "window", 1 / 2.1: "window", 1.0: "both", 1.9: "both", 2.1: "commissioning"}
@@ -396,7 +396,7 @@ def test_which_error_is_said_to_dominate() -> None:
     assert not dominant(one.model_copy(update={"commissioning_error": None}))
 
 
-def test_changes_that_cannot_be_found_are_said_to_be_so() -> None:
+def test_undetectable_changes_are_stated_as_such() -> None:
     one = next(each for each in case("partial")[0].report.parameters if each.name == "c_by")
     poor = one.model_copy(update={"detectable_loss": -1.0, "detectable_gain": 27.0, "window_s_for_wished": 4000.0})
     assert smallest_change(poor) == ("not even all of it", "more than 10-fold")
@@ -409,13 +409,13 @@ def test_changes_that_cannot_be_found_are_said_to_be_so() -> None:
     assert "The wished change of 10% of c_by is found with the present settings." in told
 
 
-def test_square_brackets_are_no_markup_of_the_terminal() -> None:
+def test_square_brackets_are_printed_literally_in_the_terminal() -> None:
     report = case("too short")[0].report
     check = report.checks[0].model_copy(update={"text": "[red]all[/red] of it [/]"})
     assert "[red]all[/red] of it [/]" in printed(report.model_copy(update={"checks": (check,)}))
 
 
-def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_terminal(folder: Path) -> None:
+def test_the_growth_that_raises_an_alert_is_on_the_page_and_in_the_terminal(folder: Path) -> None:
     text, report = written(folder, "no phase reference")
     assert {one.channel for one in report.levels} == {channel.name for channel in case("no phase reference")[2].sensors}
     growths = [one.model_copy(update={"growth": 0.6 + at / 1e4}) for at, one in enumerate(report.levels)]

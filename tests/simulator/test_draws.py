@@ -94,7 +94,7 @@ def test_anomalies_have_their_effect() -> None:
     np.testing.assert_allclose(np.sort(factors), [*np.ones(8), 1.1], rtol=1e-3)
 
 
-def test_a_crack_is_no_deeper_than_the_machine_can_be_run_with() -> None:
+def test_a_crack_is_no_deeper_than_stable_operation_allows() -> None:
     light = load_machine("light")
     light = light.model_copy(update={"operation": light.operation.model_copy(update={"speed_tolerance": 0.0})})
     nominal = light.operation.model_copy(update={"speed_rpm": 1.11 * light.operation.speed_rpm})

@@ -78,7 +78,7 @@ def _covariance(machine: Machine, condition: Condition) -> tuple[FloatArray, Flo
     return A, stationary_covariance(A, expanded_B(condition.sources))
 
 
-def test_covariances_are_those_of_lyapunov_from_the_first_sample_on() -> None:
+def test_covariances_agree_with_lyapunov_theory_from_the_first_sample_on() -> None:
     _, R = _covariance(LAB, CONDITION)
     deviation = np.sqrt(np.diag(R)[:12])
     estimates = np.array([x.T @ x / len(x) for x in stochastic()]) / np.outer(deviation, deviation)
@@ -88,7 +88,7 @@ def test_covariances_are_those_of_lyapunov_from_the_first_sample_on() -> None:
     _assert_agrees(squares, R[:12, :12] / np.outer(deviation, deviation), np.ones((12, 12)), largest_error=0.1)
 
 
-def test_displacement_is_as_much_the_integral_of_velocity_as_theory_says() -> None:
+def test_displacement_differs_from_integrated_velocity_as_theory_says() -> None:
     """Defect of Simpson's rule from sample to sample, 1e-8 m: a noise factor without scaling adds as much again."""
     A, R = _covariance(LAB, CONDITION)
     h = 1 / RATE_HZ
@@ -224,7 +224,7 @@ def test_the_realisation_depends_on_the_generator_alone() -> None:
     assert not np.any(one[:, 0] == other[:, 0])
 
 
-def test_advancing_in_parts_is_advancing_at_once() -> None:
+def test_advancing_in_parts_equals_advancing_at_once() -> None:
     whole = Plant(LAB, CONDITION, np.random.default_rng(1)).advance(3000)
     plant = Plant(LAB, CONDITION, np.random.default_rng(1))
     parts = [plant.advance(n) for n in (1, 999, 137, 1863)]
@@ -233,13 +233,13 @@ def test_advancing_in_parts_is_advancing_at_once() -> None:
     np.testing.assert_allclose(np.concatenate([part.theta_rad for part in parts]), whole.theta_rad, atol=1e-12)
 
 
-def test_the_number_of_sources_stays() -> None:
+def test_a_change_of_the_number_of_sources_is_refused() -> None:
     plant = Plant(LAB, CONDITION, np.random.default_rng(1))
     with pytest.raises(ValueError, match="0 sources instead of 4"):
         plant.change(_condition())
 
 
-def test_theoretical_rms_counts_both_parts() -> None:
+def test_theoretical_rms_includes_the_random_and_the_synchronous_part() -> None:
     rms = theoretical_rms(LAB, CONDITION)
     stochastic = theoretical_rms(BALANCED, CONDITION)
     q1, q2 = synchronous_response(LAB.rotor, LAB.operation.speed_rad_s)
@@ -339,7 +339,7 @@ def test_a_rubbing_rotor_moves_as_the_equation_of_motion_says(friction: float) -
     assert np.hypot(expected[:, 1], expected[:, 4]).min() < CLEARANCE_M < np.hypot(expected[:, 1], expected[:, 4]).max()
 
 
-def test_an_anomaly_of_no_size_is_the_healthy_plant() -> None:
+def test_an_anomaly_of_zero_size_is_the_healthy_plant() -> None:
     plain = Plant(LAB, _anomalous(stochastic=True), np.random.default_rng(5)).advance(3000).states
     none = NonlinearPlant(LAB, _anomalous(stochastic=True), np.random.default_rng(5)).advance(3000).states
     np.testing.assert_array_equal(none, plain)
@@ -350,8 +350,8 @@ def test_an_anomaly_of_no_size_is_the_healthy_plant() -> None:
         np.testing.assert_allclose(states / plain.std(axis=0), plain / plain.std(axis=0), atol=1e-6)
 
 
-def test_a_crack_from_the_start_has_run_in() -> None:
-    """Periodic from the first sample on, with the second harmonic that a healthy rotor has not."""
+def test_a_crack_present_from_the_start_is_in_steady_state() -> None:
+    """Periodic from the first sample on, with the second harmonic that a healthy rotor lacks."""
     turn = round(60 * 2200 / SPEED_RPM)
     machine = LAB.model_copy(update={"rate_hz": 2200.0})
     states = NonlinearPlant(machine, _anomalous(crack=0.3), np.random.default_rng(1)).advance(4 * turn).states
@@ -360,7 +360,7 @@ def test_a_crack_from_the_start_has_run_in() -> None:
     assert harmonics[1] > 0.02 * harmonics[0]
 
 
-def test_a_rub_that_friction_drives_off_is_refused() -> None:
+def test_a_rub_made_unstable_by_friction_is_refused() -> None:
     plant = NonlinearPlant(LAB, _anomalous(), np.random.default_rng(1))
     plant.change(_anomalous(rub=5.0, friction=1.0))
     with pytest.raises(EstimationError, match="the rub is unstable"):

@@ -1,4 +1,4 @@
-"""The stream, the same in any cut, and its publisher over real Zenoh sessions: all is waited for, nothing slept for."""
+"""The stream, identical for any block length, and its publisher over real Zenoh sessions, awaited without sleeping."""
 
 import threading
 import time
@@ -84,7 +84,7 @@ def _publishing(
         assert not thread.is_alive()
 
 
-def test_a_late_subscriber_gets_all(endpoint: str, monitor: zenoh.Session) -> None:
+def test_a_late_subscriber_receives_everything(endpoint: str, monitor: zenoh.Session) -> None:
     half = threading.Event()
     with _publishing(endpoint, lambda s: half.set() if s.blocks >= 40 else None, pace=20.0, linger_s=60.0) as (
         stop,
@@ -113,7 +113,7 @@ def test_a_late_subscriber_gets_all(endpoint: str, monitor: zenoh.Session) -> No
     assert ChannelDescriptor.model_validate_json(descriptor.samples[0][0]) == MACHINE.descriptor
 
 
-def test_the_descriptor_answers_a_query_and_the_token_shows_who_is_there(endpoint: str, monitor: zenoh.Session) -> None:
+def test_the_descriptor_answers_a_query_and_a_token_shows_the_publisher(endpoint: str, monitor: zenoh.Session) -> None:
     changes: list[zenoh.SampleKind] = []
     monitor.liveliness().declare_subscriber(
         MACHINE.keys.publisher_alive, lambda s: changes.append(s.kind), history=True
@@ -142,7 +142,7 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(endpoin
     assert stream.sequences == list(range(1500))
 
 
-def test_arrow_streams_are_the_same(endpoint: str, monitor: zenoh.Session) -> None:
+def test_arrow_streams_carry_the_same_samples(endpoint: str, monitor: zenoh.Session) -> None:
     stream = _Received(monitor, MACHINE.keys.stream)
     with _publishing(endpoint, pace=None, encoding="arrow", wait_for_subscriber_s=30.0):
         until(lambda: len(stream.samples) >= 60, "60 blocks")
@@ -152,7 +152,7 @@ def test_arrow_streams_are_the_same(endpoint: str, monitor: zenoh.Session) -> No
         np.testing.assert_array_equal(one.samples, other.samples)
 
 
-def test_nothing_is_sent_to_nobody(endpoint: str, monitor: zenoh.Session) -> None:
+def test_nothing_is_sent_before_there_is_a_subscriber(endpoint: str, monitor: zenoh.Session) -> None:
     alive = threading.Event()
     monitor.liveliness().declare_subscriber(MACHINE.keys.publisher_alive, lambda _: alive.set(), history=True)
     sent = threading.Event()
@@ -168,7 +168,7 @@ def test_nothing_is_sent_to_nobody(endpoint: str, monitor: zenoh.Session) -> Non
     until(lambda: stream.sequences[:1] == [0], "first block")
 
 
-def test_nobody_in_time_is_an_error(endpoint: str) -> None:
+def test_no_subscriber_in_time_is_an_error(endpoint: str) -> None:
     with _publishing(endpoint, pace=1.0, wait_for_subscriber_s=0.1) as (_, outcome):
         until(lambda: len(outcome) == 1, "outcome")
     assert isinstance(outcome[0], PublishError)
@@ -208,7 +208,7 @@ def _all(scenario: Scenario, block_s: float = 0.1) -> tuple[FloatArray, list[Tru
 
 
 @pytest.mark.parametrize("block_s", [0.0005, 0.37, 100.0])
-def test_the_cut_into_blocks_changes_no_bit(block_s: float) -> None:
+def test_the_block_length_changes_no_bit(block_s: float) -> None:
     samples, truth = _all(SCENARIO)
     again, truth_again = _all(SCENARIO, block_s)
     assert again.tobytes() == samples.tobytes()
@@ -233,7 +233,7 @@ def test_a_rate_that_is_no_whole_number_of_nanoseconds_does_not_drift() -> None:
     assert last.start_ns - first.start_ns == round(count * 3e9 / 2048)
 
 
-def test_truth_tells_what_happens_when() -> None:
+def test_truth_records_state_every_change_with_its_time() -> None:
     _, truth = _all(SCENARIO)
     assert [entry.data_s for entry in truth] == [0, 1, 1.2345, 2, 2.2, 3, 3.011, 3.3, 3.5]
     assert [entry.time_ns - DEFAULT_START_NS for entry in truth] == [round(entry.data_s * 1e9) for entry in truth]
@@ -281,7 +281,7 @@ def test_sensors_never_change_how_the_machine_moves() -> None:
     np.testing.assert_array_equal(one[:4000, names.index("z2")], other[:4000, names.index("z2")])
 
 
-def test_channels_have_noise_of_their_own() -> None:
+def test_channels_have_independent_noise() -> None:
     quiet = SCENARIO.model_copy(update={"events": (), "duration_s": 20.0, "sensors": Sensors()})
     clean, _ = _all(quiet)
     noisy, _ = _all(quiet.model_copy(update={"sensors": Sensors(noise_relative=0.5)}))

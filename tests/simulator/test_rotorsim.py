@@ -113,7 +113,7 @@ def test_a_signal_ends_publishing_cleanly(tmp_path: Path, number: signal.Signals
             assert three.wait(180)
             assert publisher.stop(number) == 0
         assert gone.wait(180)
-    # How far it is, and nothing else.
+    # Progress and nothing else.
     assert [line for line in publisher.errors().splitlines() if "s of data" not in line] == []
     (said,) = publisher.output().splitlines()
     assert said.startswith("published ")
@@ -121,7 +121,7 @@ def test_a_signal_ends_publishing_cleanly(tmp_path: Path, number: signal.Signals
 
 
 @pytest.mark.parametrize("listened", [True, False])
-def test_publishing_shows_how_far_it_is_and_whether_anybody_listens(listened: bool) -> None:
+def test_publishing_shows_progress_and_whether_there_is_a_subscriber(listened: bool) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         where = f"tcp/127.0.0.1:{free.getsockname()[1]}"

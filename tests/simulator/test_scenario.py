@@ -61,7 +61,7 @@ def test_shapes_and_anomalies_survive_the_file(tmp_path: Path) -> None:
     assert Scenario.model_validate_json(scenario.model_dump_json()) == scenario
 
 
-def test_the_shipped_scenarios_are_what_they_are_called() -> None:
+def test_the_shipped_scenarios_contain_the_fault_in_their_name() -> None:
     faults = {"k_by": -0.25, "c_by": -0.3, "k_bz": -0.25, "c_bz": -0.3, "e": 0.3}
     assert set(shipped_scenarios()) == {"healthy", *faults}
     healthy, _ = load_scenario("healthy")
@@ -98,7 +98,7 @@ def test_a_file_extends_another_table_by_table(tmp_path: Path) -> None:
     assert [source.name for source in scenario.sources] == ["disc y"]
 
 
-def test_a_machine_file_lies_beside_the_scenario(tmp_path: Path) -> None:
+def test_a_machine_file_is_found_beside_the_scenario(tmp_path: Path) -> None:
     shipped = Path(__file__).parents[2] / "models" / "machines" / "lab.toml"
     _file(tmp_path, shipped.read_text(encoding="utf-8").replace('name = "lab"', 'name = "twin"'), "twin.toml")
     _, machine = load_scenario(_file(tmp_path, MINIMAL.replace('"lab"', '"twin.toml"')))
@@ -226,7 +226,7 @@ def _at(timeline: Timeline, sample: int) -> Condition:
     return [condition for first, condition in timeline.conditions if first <= sample][-1]
 
 
-def test_a_step_acts_at_the_nearest_sample_and_is_from_the_original_machine() -> None:
+def test_a_step_acts_at_the_nearest_sample_relative_to_the_original_machine() -> None:
     timeline = _compiled(Event(at_s=10.0003, parameter="k_by", relative_change=-0.25))
     assert [first for first, _ in timeline.conditions] == [0, 20001]
     assert _at(timeline, 20000).relative_changes["k_by"] == 0.0

@@ -75,7 +75,7 @@ def test_noise_is_stationary_from_the_first_sample() -> None:
     assert first.var() == pytest.approx(1.0, rel=5 * np.sqrt(2 / 4000))  # one innovation alone would have 0.06
 
 
-def test_noise_does_not_depend_on_the_pieces() -> None:
+def test_noise_does_not_depend_on_how_it_is_split() -> None:
     settings = SensorSettings(noise_corner_hz=100.0)
     whole = _sensor(settings).noise(1000)
     sensor = _sensor(settings)
@@ -102,7 +102,7 @@ VALUES = np.array([-3e-6, 1e-6, 5e-6])
     ],
     ids=lambda value: "+".join(value) or "healthy" if isinstance(value, dict) else "",
 )  # fmt: skip
-def test_each_fault(faults: SensorFaults, expected: list[float]) -> None:
+def test_each_sensor_fault_changes_the_samples(faults: SensorFaults, expected: list[float]) -> None:
     sensor = _sensor(SensorSettings())
     sensor.measure(np.array([7e-6]), np.zeros(1), {})  # what a stuck sensor repeats
     samples = sensor.measure(VALUES, np.array([1.0, -1.0, 1.0]), faults)
@@ -120,7 +120,7 @@ def test_a_stuck_sensor_holds_until_it_is_released() -> None:
     np.testing.assert_allclose(sensor.measure(VALUES, zero, {}), VALUES * 1e6)
 
 
-def test_an_unused_noise_is_drawn_all_the_same() -> None:
+def test_noise_is_drawn_even_before_it_is_used() -> None:
     """A sensor whose noise begins later has the noise it would have had anyway."""
     channel = DISPLACEMENT.model_dump()
     noisy = _bank(_machine(channel), Sensors(noise_relative=0.1)).measure(_plant(), 0)
@@ -153,7 +153,7 @@ def test_a_shaft_angle_with_errors_wraps() -> None:
 
 
 @pytest.mark.parametrize("pieces", [(60,), (7, 1, 30, 22)])
-def test_a_delay_shifts_by_whole_samples_whatever_the_pieces(pieces: tuple[int, ...]) -> None:
+def test_a_delay_shifts_by_whole_samples_however_it_is_split(pieces: tuple[int, ...]) -> None:
     channel = DISPLACEMENT.model_dump()
     faults: dict[str, list[tuple[int, SensorFaults]]] = {"XE": [(20, {"delay": 0.0051}), (50, {})]}  # 10.2 samples
     bank, plant, first, seen = _bank(_machine(channel), Sensors(), faults), _plant(60), 0, []

@@ -1,6 +1,6 @@
-"""Training in small: the bundle that it writes, that it is repeatable, and that the networks learn.
+"""Training on a small scale: the bundle it writes, repeatability, and whether the networks learn.
 
-What imports torch is imported in the tests: it takes seconds, and every worker reads this module.
+Modules with torch are imported in the tests: it takes seconds, and every worker reads this module.
 """
 
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s
 COARSE = LAB.model_copy(update={"window": SHORT.window.model_copy(update={"segment_s": 2.5})})
 """And much of the rest into the principal directions of its spectra."""
 DRAWS = 240
-"""Of which a training makes eight batches."""
+"""Conditions, of which a training makes eight batches."""
 
 
 def windows(machine: Machine, purpose: Purpose, stream: int, count: int, kept: tuple[str, ...]) -> list[Any]:
@@ -44,7 +44,7 @@ def windows(machine: Machine, purpose: Purpose, stream: int, count: int, kept: t
 
 @contextmanager
 def briefly() -> Iterator[None]:
-    """Fewer steps, draws and degrees of freedom to choose from, where nothing is asked of how accurate networks are."""
+    """Fewer steps, draws and degrees of freedom, where the accuracy of networks does not matter."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
         patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
@@ -55,7 +55,7 @@ def briefly() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    """As the command makes it, of fewer windows than it admits."""
+    """A bundle as the command makes it, of fewer windows than it admits."""
     from simulator.training.command import train_for  # noqa: PLC0415
 
     folder: Path = tmp_path_factory.mktemp("trained") / "bundle"
@@ -70,7 +70,7 @@ def recipe(bundle: Bundle) -> FeatureDraws:
     return FeatureDraws(COARSE, SEED, DRAWS // 8, basis.mean, basis.directions)
 
 
-def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_trained(bundle: Bundle) -> None:
+def test_a_bundle_holds_both_networks_of_every_equation_and_their_training(bundle: Bundle) -> None:
     assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
     assert bundle.amortised is not None
     assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
@@ -80,7 +80,7 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
     assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 5, DRAWS)
 
 
-def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_told(bundle: Bundle) -> None:
+def test_training_a_relation_network_is_repeatable_and_reports_progress(bundle: Bundle) -> None:
     from models.diagnosis.networks.training import train_network  # noqa: PLC0415
 
     equation, told = EQUATIONS[1], list[float]()
@@ -93,7 +93,7 @@ def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_tol
     assert told == sorted(told)
 
 
-def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: Bundle, recipe: FeatureDraws) -> None:
+def test_training_amortised_networks_is_repeatable_and_learns(bundle: Bundle, recipe: FeatureDraws) -> None:
     from models.diagnosis.networks.training import train_networks  # noqa: PLC0415
 
     draws = recipe
@@ -155,7 +155,7 @@ def held(layout: Layout, count: int) -> list[tuple[Any, dict[str, float]]]:
     return [(simulate_window(draw, number), {}) for number in range(count)]
 
 
-def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from_several() -> None:
+def test_calibration_scales_errors_for_one_source_and_for_several_separately() -> None:
     shipped = sure(load_bundle("lab", LAB).amortised)
     one, several = held(Layout.ONE_SOURCE, 6), held(Layout.INDEPENDENT, 6)
     calibrated = calibrate_networks(SHORT, replace(shipped, calibration={}, coherent={}), one, several)
@@ -171,7 +171,7 @@ def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from
     np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
 
 
-def test_a_bundle_is_calibrated_again_to_the_last_bit_without_training(bundle: Bundle, tmp_path: Path) -> None:
+def test_recalibrating_a_bundle_without_training_is_repeatable(bundle: Bundle, tmp_path: Path) -> None:
     first = tmp_path / "trained"
     save_bundle(first, COARSE, bundle.networks, bundle.manifest.training, bundle.amortised)
     with briefly():

@@ -1,4 +1,4 @@
-"""The bound of damping without parameters, against readings that know the truth for their weights."""
+"""The bound of damping without parameters, against readings that use the truth for their weights."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from models.diagnosis.baseline.rows import ROWS
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [pytest.param({}, marks=pytest.mark.long), {"c_by": -0.2}])
-def test_errors_of_an_oracle_are_those_of_the_bound(changes: dict[str, float]) -> None:
+def test_errors_of_an_oracle_agree_with_the_bound(changes: dict[str, float]) -> None:
     rotor = rotor_named("overhung")
     sizes = plan(rotor, WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5))
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(31))
@@ -22,7 +22,7 @@ def test_errors_of_an_oracle_are_those_of_the_bound(changes: dict[str, float]) -
     healthy = windows_of(sampled(rotor, condition, 24 * 30.0 + 3, 1), sizes)[:24]
     later = windows_of(sampled(rotor, changed, 12 * 30.0 + 3, 2), sizes)[:12]
     before, after = (expected(rotor, one, later[0]) for one in (condition, changed))
-    # means of what is simulated, and what is expected
+    # simulated mean spectra against the expected ones
     mean = np.mean([one.spectrum for one in later], axis=0)
     band = slice(10, 150)
     power = np.einsum("fii->i", mean[band]).real * (later[0].frequencies_hz[1] - later[0].frequencies_hz[0])

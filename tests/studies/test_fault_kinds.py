@@ -1,4 +1,4 @@
-"""Faults of other kinds act on a rotor's motion as its equations have it."""
+"""Faults of other kinds act on a rotor's motion as its equations say."""
 
 import numpy as np
 

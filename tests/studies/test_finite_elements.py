@@ -1,4 +1,4 @@
-"""Finite-element rotors against closed forms, the Ljapunov equation and the frequency response."""
+"""Finite-element rotors against closed forms, the Lyapunov equation and the frequency response."""
 
 import math
 from dataclasses import replace
@@ -102,7 +102,7 @@ def test_an_unbalance_drives_the_forward_whirl_which_is_the_faster_one() -> None
     assert moved[-1, slow] > 5 * moved[1, slow]
 
 
-def test_the_ljapunov_covariance_is_the_integral_of_the_spectrum() -> None:
+def test_the_lyapunov_covariance_is_the_integral_of_the_spectrum() -> None:
     rotor = rotor_named("overhung")
     equations, sources = assemble(rotor, rotor.speed_rad_s), forces(rotor)
     covariance = covariance_under(equations, sources)
@@ -119,7 +119,7 @@ def test_the_ljapunov_covariance_is_the_integral_of_the_spectrum() -> None:
 
 
 @pytest.mark.parametrize("name", ["overhung", "both-sides"])
-def test_simulated_variances_are_those_of_the_ljapunov_equation(name: str) -> None:
+def test_simulated_variances_agree_with_the_lyapunov_equation(name: str) -> None:
     rotor = rotor_named(name)
     still = replace(rotor, discs=tuple(replace(disc, unbalance_kg_m=0.0) for disc in rotor.discs))
     sources = forces(rotor)
@@ -146,7 +146,7 @@ def test_unbalance_alone_gives_the_frequency_response() -> None:
     assert motion.values == pytest.approx(expected)
 
 
-def test_the_stepped_rotor_is_the_linear_one_where_the_cubic_stiffness_vanishes() -> None:
+def test_the_stepped_rotor_equals_the_linear_one_for_vanishing_cubic_stiffness() -> None:
     linear = rotor_named("overhung")
     stepped = replace(linear, bearings=(replace(linear.bearings[0], cubic_N_per_m3=1e-9), *linear.bearings[1:]))
     one, other = (
@@ -156,7 +156,7 @@ def test_the_stepped_rotor_is_the_linear_one_where_the_cubic_stiffness_vanishes(
     assert np.all(np.std(one - other, axis=0) < 2e-3 * np.std(one, axis=0))  # what is left of the start has decayed
 
 
-def test_cubic_stiffness_whirls_as_harmonic_balance_says_and_converges_with_the_square_of_the_step() -> None:
+def test_whirl_under_cubic_stiffness_converges_to_harmonic_balance() -> None:
     rotor = rotor_named("stiffening")
     bearing = replace(rotor.bearings[0], k_z=rotor.bearings[0].k_y, c_z=rotor.bearings[0].c_y)
     heavy = tuple(replace(disc, unbalance_kg_m=4 * disc.unbalance_kg_m) for disc in rotor.discs)
@@ -187,7 +187,7 @@ def test_an_unstable_rotor_is_refused() -> None:
 
 
 def film_force(film: Film, speed_rad_s: float, at: FloatArray, rate: FloatArray) -> FloatArray:
-    """Of Reynolds' equation for a short bearing on the journal, by quadrature round it; shape (2,), N."""
+    """Force on the journal from Reynolds' equation for a short bearing, by quadrature; shape (2,), N."""
     angle = np.arange(40_000) * (2 * np.pi / 40_000)
     round_ = np.array([np.cos(angle), np.sin(angle)])
     wedge = speed_rad_s * (at @ [round_[1], -round_[0]]) - 2 * rate @ round_
@@ -223,7 +223,7 @@ def test_a_film_without_load_whirls_at_half_the_speed_and_a_loaded_one_does_not(
             assert film.eccentricity(1500.0) < 0.05
 
 
-def test_a_stand_sways_with_all_that_stands_on_it_and_a_stiff_one_is_the_ground() -> None:
+def test_a_stand_sways_with_the_mass_on_it_and_a_stiff_one_acts_as_ground() -> None:
     rotor = rotor_named("soft-stand")
     stand = sure(rotor.stand)
     total = stand.mass_kg + sum(one.mass_kg for one in rotor.discs) + sum(b.housing_kg for b in rotor.bearings)
@@ -236,7 +236,7 @@ def test_a_stand_sways_with_all_that_stands_on_it_and_a_stiff_one_is_the_ground(
     assert found[:6] == pytest.approx(ground[:6], rel=1e-3)
 
 
-def test_a_mesh_is_a_spring_along_its_line_of_pressure_and_sounds_at_its_teeth() -> None:
+def test_a_gear_mesh_is_a_spring_and_excites_at_tooth_frequency() -> None:
     rotor = rotor_named("geared")
     gear = sure(rotor.gear)
     free = assemble(replace(rotor, gear=None), rotor.speed_rad_s)
@@ -254,7 +254,7 @@ def test_a_mesh_is_a_spring_along_its_line_of_pressure_and_sounds_at_its_teeth()
     assert math.hypot(*parts) == pytest.approx(abs(response[place(rotor, 0, "z")]))
 
 
-def test_changes_reach_what_they_name() -> None:
+def test_changes_act_on_the_named_parameters() -> None:
     rotor = rotor_named("stiffening")
     other = changed_rotor(rotor, {"k_bz": -0.1, "c_by": -0.3, "e": 0.2})
     one, two = rotor.bearings[0], other.bearings[0]
@@ -269,7 +269,7 @@ def test_changes_reach_what_they_name() -> None:
         changed_rotor(rotor, {"EI": 0.1})
 
 
-def test_windows_hold_what_the_plan_says_and_see_the_unbalance() -> None:
+def test_windows_follow_the_plan_and_show_the_unbalance() -> None:
     rotor = rotor_named("between")
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(3))
     sizes = plan(rotor, WindowSizes(length_s=20.0))
@@ -285,7 +285,7 @@ def test_windows_hold_what_the_plan_says_and_see_the_unbalance() -> None:
     assert level / np.sqrt(np.sum(np.abs(expected[[1, 3]]) ** 2) / 2) == pytest.approx(1.5, rel=0.25)
 
 
-def test_the_stream_gives_the_windows_that_the_rotor_gives() -> None:
+def test_the_stream_gives_the_same_windows_as_the_samples() -> None:
     rotor, sizes = rotor_named("overhung"), WindowSizes(length_s=20.0)
     samples = sampled(rotor, RunCondition(forces(rotor), rotor.speed_rad_s), 23.0, 3)
     machine = machine_of(rotor, sizes)
@@ -298,7 +298,7 @@ def test_the_stream_gives_the_windows_that_the_rotor_gives() -> None:
     assert found.correlation / scale == pytest.approx(direct.correlation / scale, abs=1e-5)
 
 
-def test_the_machine_file_tells_channels_and_sampling_and_nothing_of_the_rotor() -> None:
+def test_the_machine_file_holds_channels_and_sampling_but_not_the_rotor() -> None:
     rotor = rotor_named("both-sides")
     file = machine_of(rotor, WindowSizes(), (*MOTION, "y1_ddot"))
     assert file.model_fields_set == {"site", "name", "description", "rate_hz", "window", "sensors"}

@@ -1,4 +1,4 @@
-"""The study of levels: its streams are what they say, and what it counts is counted right."""
+"""The study of levels: its streams are as drawn, and its counts are right."""
 
 from dataclasses import replace
 
@@ -76,7 +76,7 @@ def test_alarms_per_month_have_the_exact_interval_of_a_poisson_count() -> None:
 
 
 @pytest.mark.parametrize("topic", ["beside", "years"])
-def test_drawn_levels_are_those_of_a_simulation_in_time(topic: str) -> None:
+def test_drawn_levels_agree_with_a_simulation_in_time(topic: str) -> None:
     study = level_years(Options(windows=1, seed=99, small=True))
     cell = next(one for one in study.cells if one.keys["topic"] == topic)
     rows = list(cell.measure(None, 0))

@@ -47,7 +47,7 @@ def test_ssi_follows_the_mode_that_a_soft_bearing_lowers() -> None:
 
 
 @pytest.mark.long
-def test_a_peer_learns_healthy_and_scores_a_large_change_above_its_limit() -> None:
+def test_a_peer_scores_a_large_change_far_above_a_healthy_window() -> None:
     learned = [_samples(number) for number in range(12)]
     fresh, changed = _samples(60), _samples(50, {"k_by": -0.3})
     for peer in (SubspaceModes(LAB), FeatureVector(LAB)):
@@ -55,7 +55,7 @@ def test_a_peer_learns_healthy_and_scores_a_large_change_above_its_limit() -> No
         assert peer.score(peer.features(changed)) > 4 * peer.score(peer.features(fresh)), peer.name
 
 
-def test_a_lost_mode_does_not_end_the_score() -> None:
+def test_a_lost_mode_is_left_out_of_the_score() -> None:
     rng = np.random.default_rng(5)
     peer = SubspaceModes(LAB)
     peer.fit(rng.standard_normal((40, 8)))
@@ -66,7 +66,7 @@ def test_a_lost_mode_does_not_end_the_score() -> None:
     assert np.isnan(peer.score(np.full(8, np.nan)))
 
 
-def test_hotellings_limit_is_that_of_gaussian_features() -> None:
+def test_hotellings_limit_holds_the_rate_for_gaussian_features() -> None:
     """2000 draws of n = 30 learned windows and one further one, p = 8 features; seed 9."""
     rng = np.random.default_rng(9)
     peer, count, n, p = SubspaceModes(LAB), 0, 30, 8
@@ -95,7 +95,7 @@ def drawn() -> tuple[Scenario, WindowStatistics]:
     return draw_condition(draw, 0), simulate_window(draw, 0)
 
 
-def test_full_correlation_is_theory_with_the_unbalance_in_it() -> None:
+def test_full_correlation_agrees_with_theory_including_the_unbalance() -> None:
     scenario, window = drawn()
     speed = window.speed_rad_s
     A = expanded_A(RIG.rotor, speed, scenario.sources)
@@ -112,7 +112,7 @@ def test_full_correlation_is_theory_with_the_unbalance_in_it() -> None:
         assert error < 0.12, (reference, response)  # 60 s; sensor noise adds to lag 0 of R77
 
 
-def test_a_wrong_sign_of_the_synchronous_lag_would_show() -> None:
+def test_the_synchronous_lag_has_the_right_sign() -> None:
     """y1 and z1 turn a quarter revolution apart: the sign of Ωτ decides the sign of R14."""
     _, window = drawn()
     q1, q2 = synchronous_response(RIG.rotor, window.speed_rad_s)

@@ -67,7 +67,7 @@ def test_training_fits_its_own_windows_and_is_repeatable(
     assert np.mean([first.deviation(window) for window in training]) < 0.05
 
 
-def test_a_reading_names_equations(networks: list[PaperNetwork], healthy: list[WindowStatistics]) -> None:
+def test_a_changed_stiffness_flags_its_equation(networks: list[PaperNetwork], healthy: list[WindowStatistics]) -> None:
     paper = PaperDiagnostician.calibrated(networks, healthy, false_alarm_rate=0.2)
     # As calibrated: of the six windows exactly the largest score is at the limit, none above it.
     assert not any(paper.flagged(paper.deviations(window)) for window in healthy)

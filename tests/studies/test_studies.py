@@ -73,7 +73,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
 
 
 def toy(windows: int = 4, machine: str = "none") -> Study:
-    """Under the name of a study that has words for its page."""
+    """A study under a name that has texts for its page."""
     columns = {"named": lambda rows: rate(row["named"] for row in rows)}
     return Study(
         name="sensors", cells=tuple(Cell({"changed": changed}, windows, _measure) for changed in ("healthy", "e +20%")),
@@ -95,7 +95,7 @@ def test_an_interrupted_study_carries_on_and_gives_the_same_records(tmp_path: Pa
     assert {record["sum"] for record in read(toy(), tmp_path)} == {6}
 
 
-def test_more_windows_are_welcome_and_another_plan_is_not(tmp_path: Path) -> None:
+def test_windows_can_be_added_but_another_plan_is_refused(tmp_path: Path) -> None:
     run(toy(2), Options(windows=2), tmp_path, map)
     kept = run(toy(3), Options(windows=3), tmp_path, map)
     assert (len(read(toy(3), tmp_path)), len(read(toy(2), tmp_path))) == (12, 8)
@@ -122,7 +122,7 @@ def test_the_page_has_figures_goals_and_how_to_run_it_again(tmp_path: Path) -> N
         assert len({line.count("|") for line in block.splitlines()}) == 1, block
 
 
-def test_wrong_arguments_exit_with_2_and_a_sentence(tmp_path: Path) -> None:
+def test_wrong_arguments_exit_with_2_and_a_message(tmp_path: Path) -> None:
     app = command.app
     for arguments, message in (
         (["everything"], "'everything', expected among evaluate"),
@@ -136,7 +136,7 @@ def test_wrong_arguments_exit_with_2_and_a_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", command.STUDIES)
-def test_what_a_study_sends_to_other_processes_can_be_sent(name: str) -> None:
+def test_the_cells_of_a_study_can_be_pickled(name: str) -> None:
     study = command.STUDIES[name](Options(windows=2, small=True))
     assert pickle.loads(pickle.dumps(study.cells))  # noqa: S301  # what was just written
 
@@ -184,7 +184,7 @@ def test_another_hop_keeps_the_window() -> None:
         with_hop(LAB, 1.5)
 
 
-def test_files_tell_what_their_level_allows() -> None:
+def test_machine_files_have_the_knowledge_level_asked_for() -> None:
     for name in SUBJECTS:
         subject = subject_named(name)
         for level in KnowledgeLevel:
@@ -242,7 +242,7 @@ def test_a_goal_is_missed_only_where_the_whole_interval_misses_it_and_not_by_cha
     assert holding("false alarms", {"lab": shares(5, 50)}, 0.01).verdict == "missed"
 
 
-def test_limits_keep_the_declared_rate_alone_and_together_and_none_decides_those_of_another() -> None:
+def test_limits_keep_the_declared_rate_alone_and_together_whatever_the_scale() -> None:
     """400 repetitions of 99 healthy windows and 50 further ones; seed 9."""
     rng = np.random.default_rng(9)
 
@@ -265,7 +265,7 @@ def test_limits_keep_the_declared_rate_alone_and_together_and_none_decides_those
         limit_of(np.ones(98), 0.01)
 
 
-def test_records_are_of_all_that_networks_depend_on() -> None:
+def test_the_physics_hash_covers_what_networks_depend_on() -> None:
     lab = load_machine("lab")
     alarm = lab.model_copy(update={"alarms": lab.alarms.model_copy(update={"on_delay_s": 61.0})})
     rotor = lab.model_copy(update={"rotor": lab.rotor.model_copy(update={"m1_kg": 0.51})})
@@ -273,7 +273,7 @@ def test_records_are_of_all_that_networks_depend_on() -> None:
     assert physics_hash(rotor) != physics_hash(lab)
 
 
-def test_figures_are_of_the_records_that_are_asked_for() -> None:
+def test_figures_use_only_the_selected_records() -> None:
     records = [{"method": by, "named": by != "paper", "e": None} for by in ("likelihood", "network", "paper")]
     assert [row["method"] for row in where(records, method=("paper", "network"), e=None)] == ["network", "paper"]
     assert among(share("named"), method=("likelihood", "network"))(records) == shares(2, 2)
@@ -302,7 +302,7 @@ def window() -> WindowStatistics:
 
 
 @pytest.mark.parametrize("number", ["28", "29", "31"])
-def test_the_variant_with_everything_on_is_the_equation_of_the_table(window: WindowStatistics, number: str) -> None:
+def test_the_variant_with_everything_on_equals_the_equation_of_the_table(window: WindowStatistics, number: str) -> None:
     equation = next(one for one in EQUATIONS if one.number == number)
     rows = variant_equation(PRESENT, number).rows(window_view(window, SHORT), SHORT)
     expected = equation.rows(window_view(window, SHORT), SHORT)
@@ -322,7 +322,7 @@ def test_y1_alone_without_tilt_is_the_printed_equation_28(window: WindowStatisti
     np.testing.assert_allclose(rows.signatures[:, 0], k_over_m * printed[:, 0])
 
 
-def test_a_unit_takes_the_place_of_the_norm(window: WindowStatistics) -> None:
+def test_a_given_unit_replaces_the_norm(window: WindowStatistics) -> None:
     view = window_view(window, SHORT)
     equation = variant_equation(PRESENT, "28")
     rows = equation.rows(view, SHORT)
@@ -331,14 +331,14 @@ def test_a_unit_takes_the_place_of_the_norm(window: WindowStatistics) -> None:
     np.testing.assert_allclose(in_unit.target, rows.target / (2 * rows.norm))
 
 
-def test_the_synchronous_part_is_put_back_as_the_paper_has_it(window: WindowStatistics) -> None:
+def test_the_synchronous_part_is_restored_as_in_the_paper(window: WindowStatistics) -> None:
     seen = as_seen(replace(PRESENT, has=PRESENT.has - {"synchronous"}), window)
     i, j = window.states.index("y1"), window.states.index("z2")
     np.testing.assert_allclose(seen.correlation[:, i, j], full_correlation(window, "y1", "z2"))
     assert as_seen(PRESENT, window) is window
 
 
-def test_the_linear_fit_leaves_nothing_that_its_inputs_explain(window: WindowStatistics) -> None:
+def test_the_residual_of_the_linear_fit_is_orthogonal_to_its_inputs(window: WindowStatistics) -> None:
     equation = variant_equation(PRESENT, "31")
     rows = equation.rows(window_view(window, SHORT), SHORT)
     fit = linear_fit(equation, [window], SHORT)

@@ -1,4 +1,4 @@
-"""The overhung rotor of `benchmarks.finite_elements`, for tests of what must not depend on six degrees of freedom."""
+"""The overhung rotor of `benchmarks.finite_elements`, for tests that must not depend on six degrees of freedom."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ SIZES = observed.WindowSizes(length_s=30.0, hop_s=2.5, segment_s=2.5)
 def windows_under(
     rotor: BeamRotor, run: observed.RunCondition, count: int, seed: int, change: Callable[[FloatArray], object] = len
 ) -> list[WindowStatistics]:
-    """Windows of 30 s that follow on each other, of samples that may be changed in place."""
+    """Consecutive windows of 30 s of samples that `change` may alter in place."""
     sizes = observed.plan(rotor, SIZES)
     samples = observed.sampled(rotor, run, 30.0 * count + sizes.preamble / sizes.rate_hz + 0.1, seed)
     change(samples)
@@ -62,7 +62,7 @@ def windows_under(
 
 
 def plan(hops: int = 12, states: tuple[str, ...] = observed.MOTION, speed_rad_s: float | None = None) -> Plan:
-    """A plan for some columns of these samples; with a speed to look for there is no angle."""
+    """A plan for some columns of these samples; given a speed to look for, it has no shaft angle."""
     made = observed.plan(ROTOR, observed.WindowSizes(length_s=5.0 * hops), states)
     columns = np.array([PROBES.index(name) for name in states])
     angle_column = len(PROBES) if speed_rad_s is None else None
@@ -73,7 +73,7 @@ def plan(hops: int = 12, states: tuple[str, ...] = observed.MOTION, speed_rad_s:
 def recorded(
     rotor: BeamRotor, excitation: Excitation, seed: int, count: int = 1, **noise: float
 ) -> tuple[WindowStatistics, ...]:
-    """Windows of a minute that follow on each other."""
+    """Consecutive windows of one minute."""
     return tuple(observed.windows_of(simulate(rotor, excitation, 60.0 * count + 3, seed, **noise), plan()))
 
 

@@ -48,8 +48,8 @@ def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
         ("e", changed_rotor(ROTOR, {"e": 0.5}), 0.2, 0.9),
     ],
 )
-def test_what_changed_is_named_and_nothing_else(name: str, rotor: BeamRotor, low: float, high: float) -> None:
-    # Among random vibration of twice that level, half the unbalance more is named in every other window.
+def test_only_the_changed_parameter_is_named(name: str, rotor: BeamRotor, low: float, high: float) -> None:
+    # Under twice this random force, an unbalance 50 % larger is named in only every other window.
     (window,) = recorded(rotor, replace(OTHER, level_N=2.0) if name == "e" else OTHER, 3)
     diagnosis = monitor().diagnose(window)
     assert isolate_window(diagnosis, 0.001).changed == (name,)
@@ -58,7 +58,7 @@ def test_what_changed_is_named_and_nothing_else(name: str, rotor: BeamRotor, low
 
 
 @pytest.mark.slow
-def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None:
+def test_intervals_from_little_healthy_data_are_wider_and_still_hold() -> None:
     sizes = plan(hops=6)
     short = BaselineDiagnostician(learn_baseline(windows_of(simulate(ROTOR, Excitation(), 33, 5), sizes)))
     for window in recorded(ROTOR, OTHER, 2, 3):
@@ -75,7 +75,7 @@ def test_sensor_noise_does_not_bias() -> None:
     assert np.all(np.abs(z.mean(axis=0)) < 2), z
 
 
-def test_what_cannot_be_read_says_why() -> None:
+def test_parameters_that_cannot_be_read_state_a_reason() -> None:
     (window,) = recorded(ROTOR, OTHER, 3)
     diagnosis = monitor().diagnose(replace(window, synchronous=None))
     reasons = {reading.name: reading.reason for reading in diagnosis.parameters}
@@ -93,7 +93,7 @@ def test_what_cannot_be_read_says_why() -> None:
 
 
 @pytest.mark.parametrize("plane", ["y", "z"])
-def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
+def test_a_1x_vector_that_no_unbalance_causes_is_unexplained(plane: str) -> None:
     """An unbalance is one force in both planes: a plane whose sensors are all reversed shows two."""
     quiet = replace(OTHER, level_N=1.0)
     reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
@@ -105,12 +105,12 @@ def test_a_rotation_that_no_unbalance_makes_names_nothing(plane: str) -> None:
     assert "the 1× vibration is not what an unbalance causes" in diagnosis.unexplained
     reasons = {one.name: one.reason for one in diagnosis.parameters}
     assert reasons["e"] == diagnosis.unexplained
-    for turned in (2.0, 0.5j, -1.0):  # another unbalance is one, wherever its heavy spot is
+    for turned in (2.0, 0.5j, -1.0):  # another unbalance is explained at any angle
         more = reading.diagnose(replace(window, synchronous=sure(window.synchronous) * turned))
         assert not more.unexplained
 
 
-def test_errors_with_nothing_beside_them_make_no_unbalance() -> None:
+def test_an_unbalance_smaller_than_its_errors_is_not_determined() -> None:
     """As two sines in all channels left of a rotor: a hop of that was a defect in the monitor."""
     lost = positive(np.array([[-8.0, 0.0], [-12.0, -2.0]]) * 2.0**40)  # what cancels in such a hop
     with pytest.raises(EstimationError, match="not determined well enough: it is smaller than its errors"):

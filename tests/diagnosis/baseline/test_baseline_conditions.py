@@ -1,4 +1,4 @@
-"""Baselines of several speeds and conditions, kept as JSON, and what they say of themselves."""
+"""Baselines of several speeds and conditions: storage as JSON and self-consistency."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def baseline() -> Baseline:
 
 
 @pytest.mark.slow
-def test_every_commissioned_speed_has_its_own_unbalance_and_conditions_that_agree_leave_no_doubt() -> None:
+def test_each_commissioned_speed_has_its_own_unbalance_and_conditions_may_agree() -> None:
     assert [round(one.speed_rad_s / 2 / np.pi) for one in baseline().rotations] == [24, 33]
     monitor = BaselineDiagnostician(baseline())
     for seed, rotor in ((83, ROTOR), (84, FAST)):
@@ -72,7 +72,7 @@ def test_an_unphysical_relation_is_not_determined() -> None:
     assert "damping, horizontal is known to" in undetermined(vague)[0]
 
 
-def test_conditions_are_one_for_each_window() -> None:
+def test_one_condition_must_be_given_per_window() -> None:
     with pytest.raises(EstimationError, match="2 conditions are given for 1 healthy windows"):
         learn_baseline(recorded(ROTOR, Excitation(), 81, 2)[:1], conditions=["a", "b"])
 
@@ -135,7 +135,7 @@ def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str
     return "" if found is None else f"{found.sentence} {100 * found.factor:.0f} {found.z > 5}"
 
 
-def test_equal_changes_of_stiffness_and_damping_look_like_a_gain_which_all_sensors_of_a_place_may_share() -> None:
+def test_equal_changes_of_stiffness_and_damping_raise_suspicion_of_a_gain() -> None:
     assert suspected(-0.1, -0.1) == "gain of y1 or of y2 -10 True"
     assert suspected(0.2, 0.19) == "gain of y1 or of y2 20 True"
     assert suspected(-0.1, 0.0) == ""

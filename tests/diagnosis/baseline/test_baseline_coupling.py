@@ -1,4 +1,4 @@
-"""Bearings that answer a motion in one plane with a force in the other, and what a relation is off elsewhere."""
+"""Bearings that couple the two planes, and the error of a relation under other conditions."""
 
 from dataclasses import replace
 from functools import cache
@@ -35,7 +35,7 @@ def later(name: str, changes: dict[str, float], number: int) -> WindowStatistics
 
 
 @pytest.mark.slow
-def test_a_film_that_couples_the_planes_is_learned_and_its_changes_are_named() -> None:
+def test_plane_coupling_of_an_oil_film_is_learned_and_changes_are_named() -> None:
     learned = baseline("fluid-film")
     again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json()).baseline()
     assert learned.rows == again.rows == COUPLED_ROWS
@@ -52,7 +52,7 @@ def test_a_film_that_couples_the_planes_is_learned_and_its_changes_are_named() -
     assert all(one.changed == ("k_by",) for one in softer)
 
 
-def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> None:
+def test_agreement_of_several_conditions_lowers_the_error_in_others() -> None:
     learned, window = baseline("overhung"), later("overhung", {}, 0)
     assert not planes_coupled(healthy("overhung"))
     assert learned.rows == ROWS
@@ -65,10 +65,10 @@ def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> N
         assert floor < two * np.sqrt(2)
         assert two < sure(alone)
     common = sure(found[0].common)
-    assert np.all(np.sqrt(np.diag(common))[:4] > (0.0045, 0.025, 0.0045, 0.025))  # no number of windows makes it less
+    assert np.all(np.sqrt(np.diag(common))[:4] > (0.0045, 0.025, 0.0045, 0.025))  # more windows do not lower it
 
 
-def test_a_relation_that_leaves_over_too_much_in_its_own_recording_is_none() -> None:
+def test_a_relation_with_a_large_remainder_is_undetermined() -> None:
     first, second = baseline("overhung").relations
     foreign = replace(baseline("overhung"), relations=(replace(sure(first), misfit=5.5), second))
     reason, none = undetermined(foreign)
@@ -77,7 +77,7 @@ def test_a_relation_that_leaves_over_too_much_in_its_own_recording_is_none() -> 
 
 
 @pytest.mark.slow
-def test_one_recording_that_leaves_a_plane_undetermined_is_not_believed_in_the_other() -> None:
+def test_a_single_recording_with_one_undetermined_plane_is_refused() -> None:
     windows = subject_named("geared").healthy(5301, 4, 6)
     with pytest.raises(EstimationError, match="horizontal: what moves with the bearing comes out at"):
         learned_baseline(windows, ["one"] * 6)

@@ -1,4 +1,4 @@
-"""Errors that belong to other conditions, and the lag from which a relation holds."""
+"""Errors that apply only under other conditions, and the lag from which a relation holds."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def error_of(diagnosis: Diagnosis, name: str) -> float:
     return next(one.standard_error or 0.0 for one in diagnosis.evaluable if one.name == name)
 
 
-def test_forces_are_alike_in_level_colour_and_direction_or_not_at_all() -> None:
+def test_alike_forces_agree_in_level_spectrum_and_direction() -> None:
     rng = np.random.default_rng(5)
     factor = rng.standard_normal((6, 2, 2)) + 1j * rng.standard_normal((6, 2, 2))
     spectra = factor @ factor.conj().transpose(0, 2, 1)
@@ -64,7 +64,7 @@ def test_forces_are_alike_in_level_colour_and_direction_or_not_at_all() -> None:
 
 
 @pytest.mark.slow
-def test_damping_is_sharper_while_the_commissioned_force_moves_the_machine() -> None:
+def test_damping_is_more_precise_under_the_commissioned_force() -> None:
     monitor = BaselineDiagnostician(baseline(3))
     for changes in ({}, {"c_by": -0.2, "e": 0.2}):
         (same,), (other,) = (windows(condition(seed, **changes), 1, 7) for seed in (3, 4))
@@ -75,7 +75,7 @@ def test_damping_is_sharper_while_the_commissioned_force_moves_the_machine() -> 
         assert reading.relative_change == pytest.approx(changes.get("c_by", 0.0), abs=3 * error_of(here, "c_by"))
 
 
-def test_several_conditions_are_not_one_force_and_without_one_a_record_is_as_it_was_before_there_was_any() -> None:
+def test_only_one_condition_has_a_force_and_records_without_one_omit_it() -> None:
     both = [*windows(condition(3), 2, 1), *windows(condition(4), 2, 2)]
     assert baseline(3).force.shape == (18, 2, 2)
     assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
@@ -87,7 +87,7 @@ def test_several_conditions_are_not_one_force_and_without_one_a_record_is_as_it_
 
 
 @pytest.mark.slow
-def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relations_that_do_not_fit_use_longer_lags(monkeypatch: pytest.MonkeyPatch) -> None:
     healthy = windows(condition(4), 4, 1)
     longer = learn_baseline(healthy)
     monkeypatch.setattr(relation, "_LONGER_LAGS_S", ())
@@ -102,7 +102,7 @@ def test_where_a_relation_does_not_fit_longer_lags_are_used(monkeypatch: pytest.
     assert [None if one is None else one.lag_from_s for one in again.relations] == lags
 
 
-def test_a_guess_of_the_memory_that_is_too_short_is_no_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_underestimating_the_memory_of_the_force_causes_no_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
     remembers = replace(COMMISSIONED, cutoff_hz=(25.0, 25.0))
     run = drawn_condition(ROTOR, SourceLayout.ONE_SOURCE, remembers, {}, np.random.default_rng(1))
     judge = BaselineDiagnostician(learned_baseline(windows(run, 4, 1), ["one"] * 4))

@@ -1,4 +1,4 @@
-"""A bearing that stiffens with its displacement, and windows that the relations do not hold in."""
+"""Bearings that stiffen with displacement, and windows in which the relations do not hold."""
 
 from dataclasses import replace
 from functools import cache
@@ -33,7 +33,7 @@ def later(name: str, commissioning: int, number: int) -> WindowStatistics:
     return subject_named(name).later(_SEED, commissioning, 0, number, {})[0]
 
 
-def test_a_stiffness_that_grew_is_expected_to_differ_by_as_much_and_any_other_by_two_per_cent() -> None:
+def test_expected_stiffness_growth_is_the_growth_seen_or_up_to_two_per_cent() -> None:
     grown, chance, falls = Growth(4e-12, 0.03, 0.005), Growth(4e-12, 0.01, 0.03), Growth(4e-12, -0.03, 0.005)
     assert grown.seen_variance(4e-12) == grown.unseen_variance(4e-12) == 0
     shown = 0.03**2 - 4 * 0.005**2
@@ -46,7 +46,7 @@ def test_a_stiffness_that_grew_is_expected_to_differ_by_as_much_and_any_other_by
 
 
 @pytest.mark.slow
-def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it() -> None:
+def test_stiffening_of_a_bearing_under_another_force_is_no_change() -> None:
     learned, window = baseline("stiffening", 1), later("stiffening", 1, 4)
     assert all(one is not None and one.slope > 2 * one.standard_error for one in learned.growth)
     monitor = BaselineDiagnostician(learned)
@@ -56,7 +56,7 @@ def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it()
     again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json())
     assert again.baseline().growth == learned.growth
     assert again.diagnostician().diagnose(window).parameters == monitor.diagnose(window).parameters
-    older = BaselineRecord.of(replace(learned, growth=()))  # as it was before there was one
+    older = BaselineRecord.of(replace(learned, growth=()))  # as before growth was recorded
     assert "growth" not in older.model_dump(mode="json")
     assert older.baseline().growth == ()
     before = next(one for one in older.diagnostician().diagnose(window).evaluable if one.name == "k_by")
@@ -66,8 +66,8 @@ def test_what_a_stiffening_bearing_does_under_another_force_is_no_change_of_it()
 
 
 @pytest.mark.slow
-def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothing() -> None:
-    # One source hid in both planes that the film couples them.
+def test_a_window_in_which_the_relations_do_not_hold_names_nothing() -> None:
+    # With one source in both planes, the commissioning could not see that the film couples them.
     monitor = BaselineDiagnostician(baseline("fluid-film", 4))
     diagnosis = monitor.diagnose(later("fluid-film", 4, 3))
     assert sure(diagnosis.misfit_z) > 8
@@ -79,7 +79,7 @@ def test_a_window_of_another_force_that_the_relations_do_not_hold_in_names_nothi
 
 @cache
 def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics, ...]]:
-    """Learned in two conditions; and later windows of the one that hardly determines the horizontal plane."""
+    """A baseline of two conditions, and later windows of the one that hardly determines the horizontal plane."""
     rotor, scene = rotor_named("plain-bearings"), replace(COMMISSIONED, cutoff_hz=(130.0, 130.0))
 
     def windows(layout: SourceLayout, count: int, seed: int) -> list[WindowStatistics]:
@@ -91,9 +91,9 @@ def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics,
     return learned, tuple(windows(SourceLayout.ONE_SOURCE, 4, 7))
 
 
-def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_of_a_sensor() -> None:
+def test_parameters_that_a_window_does_not_determine_make_no_sensor_suspect() -> None:
     learned, later_windows = with_a_force_that_hides_a_plane()
-    # As what an earlier program learned may have it: a growth that is carried is no fault of a sensor either.
+    # A growth as an earlier version may have stored it makes no sensor suspect either.
     grown = replace(
         learned, growth=tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
     )
@@ -112,7 +112,7 @@ def test_what_a_healthy_window_does_not_determine_is_not_evaluable_and_no_fault_
     assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
 
 
-def test_a_reversed_sensor_is_suspected_although_the_force_that_it_leaves_hides_the_plane() -> None:
+def test_a_reversed_sensor_is_suspected_even_in_a_hardly_determined_plane() -> None:
     learned, _ = with_a_force_that_hides_a_plane()
     rotor = rotor_named("plain-bearings")
     run = drawn_condition(rotor, SourceLayout.INDEPENDENT, COMMISSIONED, {}, np.random.default_rng(1))

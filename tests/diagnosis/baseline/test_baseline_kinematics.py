@@ -65,12 +65,12 @@ def names(diagnosis: Diagnosis) -> tuple[str, ...]:
         (("y1", "y2_dot"), 1, 3), (("y1_dot", "y2"), 1, 3), (("y1", "y2_ddot"), 2, 4),
     ],
 )  # fmt: skip
-def test_a_row_is_differentiated_as_rarely_as_possible(states: tuple[str, ...], raised: int, deepest: int) -> None:
+def test_a_row_uses_as_few_derivatives_as_possible(states: tuple[str, ...], raised: int, deepest: int) -> None:
     formation = formation_of(TERMS, states)
     assert (formation.raised, formation.deepest) == (raised, deepest)
 
 
-def test_of_several_quantities_the_one_that_needs_no_derivative_is_used() -> None:
+def test_the_quantity_that_needs_no_derivative_is_preferred() -> None:
     formation = formation_of(TERMS, DISPLACEMENTS + VELOCITIES)
     assert formation.terms[:4] == (
         (Source("y1", 0, 1.0),), (Source("y1_dot", 0, 1.0),), (Source("y2_dot", 1, 1.0),), (Source("y1_dot", 1, 1.0),),
@@ -78,7 +78,7 @@ def test_of_several_quantities_the_one_that_needs_no_derivative_is_used() -> Non
     assert formation_of(TERMS, (*DISPLACEMENTS, "y2_ddot")).terms[2] == (Source("y2_ddot", 0, 1.0),)
 
 
-def test_what_is_missing_is_said_as_a_place() -> None:
+def test_missing_measurements_are_named_by_place_and_direction() -> None:
     assert not_measured(ROWS[0].motions, ("y1", "z1", "z2")) == (
         "not measured: disc, horizontal (displacement, velocity or acceleration)"
     )
@@ -114,7 +114,7 @@ def test_kernels_differentiate_within_their_passband(deepest: int) -> None:
     ],
     ids=lambda states: states[-1],
 )
-def test_one_quantity_per_place_names_what_changed(states: tuple[str, ...]) -> None:
+def test_one_quantity_per_place_is_enough_to_name_the_change(states: tuple[str, ...]) -> None:
     monitor = monitor_of(*states)
     (same,) = recorded(ROTOR, OTHER, 73, 1)
     assert names(monitor.diagnose(of_states(same, states))) == ()
@@ -137,7 +137,7 @@ def test_the_common_part_is_part_of_the_covariance() -> None:
     assert np.linalg.eigvalsh((diagnosis.covariance - diagnosis.common) * np.outer(unit, unit))[0] > 0
 
 
-def test_a_plane_without_a_probe_says_so_and_the_other_is_read() -> None:
+def test_a_plane_without_a_probe_states_so_and_the_other_is_read() -> None:
     states = ("y1", "y2", "z1")
     monitor = monitor_of(*states)
     (same,) = recorded(ROTOR, OTHER, 73, 1)
@@ -147,7 +147,7 @@ def test_a_plane_without_a_probe_says_so_and_the_other_is_read() -> None:
 
 
 @pytest.mark.slow
-def test_without_a_phase_reference_the_unbalance_is_read_from_the_line_itself() -> None:
+def test_without_a_phase_reference_the_unbalance_is_read_from_the_1x_line() -> None:
     sizes = plan(speed_rad_s=ROTOR.speed_rad_s)
     base = windows_of(sampled(ROTOR, Excitation(), 71, 2), sizes)
     monitor = BaselineDiagnostician(learn_baseline(base))
@@ -158,7 +158,7 @@ def test_without_a_phase_reference_the_unbalance_is_read_from_the_line_itself() 
     assert abs(sure(e.relative_change) - 0.5) < 3 * sure(e.standard_error)
 
 
-def test_a_row_that_is_added_is_learned_and_read() -> None:
+def test_an_added_row_is_learned_and_read() -> None:
     second = Row("again", "28 + 29", "horizontal once more", ROWS[0].terms, (Own("EI", (0,)),))
     rows = (*ROWS, second)
     base = [of_states(window, DISPLACEMENTS) for window in healthy()]

@@ -41,7 +41,7 @@ def test_a_machine_five_times_as_fast_reads_the_same() -> None:
         assert abs(error / sure(other.standard_error) - 1) < near, one.name
 
 
-def test_lags_are_judged_by_the_time_scale() -> None:
+def test_lags_are_judged_relative_to_the_time_scale() -> None:
     window = recorded(ROTOR, Excitation(), 71, 2)[0]
     fast = faster(window)
     assert unsuitable(window) == unsuitable(fast) == ""

@@ -1,4 +1,4 @@
-"""Following a sliding window reads what searching it anew reads; news is noticed."""
+"""Following a sliding window gives the readings of a new search, and changes are noticed."""
 
 from contextlib import suppress
 from functools import lru_cache
@@ -28,7 +28,7 @@ SEED = 61
 
 @lru_cache
 def slid(layout: Layout, step: tuple[str, float] | None = None) -> tuple[SlidingWindow, tuple[WindowStatistics, ...]]:
-    """A minute and six hops; a parameter may change three hops before the end. The window as it is at the end."""
+    """The sliding window after a minute and six hops, and all full windows; a step comes three hops before the end."""
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 7, layout=layout)
     faults = [] if step is None else [Event(at_s=77.5, parameter=step[0], relative_change=step[1])]
     scenario = draw_condition(draw, 0).overridden(duration_s=92.6, faults=faults)
@@ -43,7 +43,7 @@ def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
-def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layout) -> None:
+def test_following_and_glancing_agree_with_a_full_search(layout: Layout) -> None:
     sliding, windows = slid(layout)
     assert len(windows) == 7
     following, searching = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB)
@@ -62,7 +62,7 @@ def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layo
         np.testing.assert_allclose(glanced_error, error, rtol=0.15)
 
 
-def test_news_is_not_read_at_a_glance_nor_anything_before_a_window_was_searched() -> None:
+def test_a_glance_is_refused_after_a_change_and_before_the_first_search() -> None:
     window, windows = slid(Layout.INDEPENDENT, ("k_by", -0.2))
     fits, fit = LengthFits(LAB), LikelihoodFit(LAB, follow=True)
     for full in windows:
@@ -76,7 +76,7 @@ def test_news_is_not_read_at_a_glance_nor_anything_before_a_window_was_searched(
 
 
 @pytest.mark.parametrize("step", [None, ("k_by", -0.2), ("EI", -0.1), ("e", 0.3)])
-def test_latest_hops_are_read_where_they_may_say_more(step: tuple[str, float] | None) -> None:
+def test_the_latest_hops_have_news_only_after_a_change(step: tuple[str, float] | None) -> None:
     sliding, windows = slid(Layout.INDEPENDENT, step)
     fits = LengthFits(LAB)
     fits.window(windows[-1])
@@ -84,8 +84,8 @@ def test_latest_hops_are_read_where_they_may_say_more(step: tuple[str, float] | 
 
 
 @pytest.mark.parametrize("kind", ["drift", "late copy"])
-def test_what_could_not_be_explained_leaves_nothing_behind(kind: Foreign) -> None:
-    """A window of something else in between: the next one is read as if it were the first."""
+def test_an_unexplained_window_does_not_affect_the_next(kind: Foreign) -> None:
+    """After a window of something else, the next one is read as if it were the first."""
     strange = last_window(plan_for(LAB), as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)))
     fit = LikelihoodFit(LAB, follow=True)
     with suppress(UnexplainedError):

@@ -1,4 +1,4 @@
-"""The likelihood: derivatives, readings of independent windows against the truth, the bound, and what is outside."""
+"""The likelihood: derivatives, readings of independent windows against the truth, the bound, and misfits."""
 
 import itertools
 from dataclasses import replace
@@ -27,7 +27,7 @@ from tests.windows import statistics
 
 LAB = load_machine("lab")
 SEED = 7_700_001
-"""Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""
+"""Used for the windows of this file alone, not for training, calibration or the shipped scenarios."""
 
 
 def groups_of(machine: Machine, widest_hz: float = 1.0) -> BinGroups:
@@ -44,7 +44,7 @@ def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
     np.testing.assert_allclose((groups.weights * groups.nodes_hz).sum(axis=1), groups.centre_hz, rtol=1e-12)
 
 
-def test_expected_segment_spectrum_of_a_line_in_noise() -> None:
+def test_averages_per_bin_match_hann_segments_of_white_noise() -> None:
     """The kernel and the averages per bin against Hann segments of simulated white noise.
 
     800 realisations of 59 segments: the mean over bins of the averaged periodogram's variance is known within 3 %.
@@ -79,7 +79,7 @@ def test_the_receptance_is_the_inverse_of_the_dynamic_matrix(name: str) -> None:
         assert np.abs(off).max() < 1e-9
 
 
-def test_derivatives_of_the_spectra() -> None:
+def test_slopes_of_the_spectra_equal_numerical_derivatives() -> None:
     rng = np.random.default_rng(0)
     states = plan_for(LAB).states
     scale = np.where([name.endswith("dot") for name in states], 0.04, 2e-4)
@@ -152,7 +152,7 @@ def assert_honest(z: np.ndarray) -> None:
     ("name", "layout", "excitation"),
     [
         ("lab", Layout.ONE_SOURCE, Excitation.SECOND_ORDER),
-        ("heavy", Layout.INDEPENDENT, Excitation.FOURTH_ORDER),  # which the model was not told about
+        ("heavy", Layout.INDEPENDENT, Excitation.FOURTH_ORDER),  # which the model does not know
         *(
             pytest.param(name, layout, Excitation.SECOND_ORDER, marks=pytest.mark.long)
             for name, layout in itertools.product(("lab", "heavy", "light"), Layout)
@@ -162,7 +162,7 @@ def assert_honest(z: np.ndarray) -> None:
         pytest.param("lab", Layout.INDEPENDENT, Excitation.HUMP, marks=pytest.mark.long),
     ],
 )
-def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: Layout, excitation: Excitation) -> None:
+def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout, excitation: Excitation) -> None:
     faults = {"k_by": -0.2, "c_bz": -0.3, "e": 0.2}
     draw = Draw(load_machine(name), SEED, Purpose.EVALUATION, int(layout), faults=faults, layout=layout)
     draw = replace(draw, excitation=excitation)
@@ -175,7 +175,7 @@ def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: La
 
 
 @pytest.mark.slow
-def test_a_wrong_gain_and_an_added_mass_are_outside_the_model() -> None:
+def test_a_wrong_gain_and_an_added_mass_cause_a_misfit() -> None:
     gain = Draw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
     diagnosis = LikelihoodFit(LAB).diagnose(simulate_window(gain, 0))
     assert (diagnosis.misfit_z or 0) > 5
@@ -195,7 +195,7 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
         assert abs((one.relative_change or 0) - (other.relative_change or 0)) < 0.4 * (other.standard_error or 0)
 
 
-def test_windows_of_the_same_size_at_other_frequencies_have_groups_of_their_own() -> None:
+def test_bin_groups_are_not_reused_at_other_frequencies() -> None:
     window = simulate_window(Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT), 0)
     stretched = replace(window, frequencies_hz=1.1 * window.frequencies_hz, speed_rad_s=1.1 * window.speed_rad_s)
     used = LikelihoodFit(LAB)
@@ -212,7 +212,7 @@ def test_a_dead_channel_is_named() -> None:
         LikelihoodFit(LAB).diagnose(statistics(LAB, samples))
 
 
-def test_the_bound_of_a_single_mass_on_a_spring() -> None:
+def test_the_bound_of_a_single_mass_on_a_spring_has_its_closed_form() -> None:
     """With a rigid shaft and no disc inertia the rotor is one mass per plane, and the bound has a closed form.
 
     For a lightly damped oscillator under white force, seen without noise over a wide band, damping ratio and natural
@@ -238,7 +238,7 @@ def test_the_bound_of_a_single_mass_on_a_spring() -> None:
         assert bound[f"c_b{plane}"] == pytest.approx(np.sqrt(1 / (2 * np.pi * damping * f_hz * length_s)), rel=0.06)
 
 
-def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() -> None:
+def test_the_bound_falls_with_the_root_of_time_and_rises_with_unknowns() -> None:
     states = plan_for(LAB).states
     levels = np.diag([1.0, 1.0, 0, 1.0, 1.0, 0]) * 1e-4
     noise = np.where([name.endswith("dot") for name in states], 1e-10, 1e-15)
@@ -251,7 +251,7 @@ def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() 
 
 
 @pytest.mark.parametrize("state", ["y1", "y2"])
-def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str) -> None:
+def test_a_window_of_a_single_sensor_can_be_fitted_and_explained(state: str) -> None:
     (sensor,) = (one for one in LAB.sensors if one.name == state)
     lone = LAB.model_copy(update={"sensors": (sensor, LAB.sensors[-1])})
     for number in range(4):
@@ -261,8 +261,8 @@ def test_one_sensor_is_enough_and_what_it_does_not_show_is_no_misfit(state: str)
         assert np.isfinite(sure(diagnosis.misfit_z))
 
 
-def test_a_sensor_that_shows_some_of_the_other_plane_is_told() -> None:
-    """y1 is turned by 1.7° towards z1: it was no misfit, and a gain where it was one."""
+def test_a_sensor_with_cross_talk_from_the_other_plane_is_suspected() -> None:
+    """y1 is turned by 1.7° towards z1, which once caused no misfit, or one attributed to a gain."""
     window = simulate_window(Draw(LAB, 7_700_021, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE), 2)
     mixed = np.eye(len(window.states))
     mixed[window.states.index("y1"), window.states.index("z1")] = 0.03
@@ -271,7 +271,7 @@ def test_a_sensor_that_shows_some_of_the_other_plane_is_told() -> None:
 
 
 def late(machine: Machine, window: WindowStatistics, delays_s: list[float]) -> WindowStatistics:
-    """The window with every channel of the machine, as it is mounted, coming later; of the random part alone."""
+    """The window with the random part of every channel, as it is mounted, delayed."""
     parts = np.array([[parts_seen(one).get(state, 0.0) for state in window.states] for one in machine.sensors])
     turned = np.exp(-2j * np.pi * window.frequencies_hz[:, None] * np.array(delays_s))
     made = np.linalg.pinv(parts) @ (turned[:, :, None] * parts)
@@ -287,7 +287,7 @@ def told(machine: Machine, window: WindowStatistics) -> tuple[str, float]:
 
 @cache
 def probes_of_lab(layout: Layout) -> tuple[Machine, WindowStatistics]:
-    """The rotor kit with its displacements alone, which do not check each other, healthy."""
+    """The healthy rotor kit with its displacements alone, which do not check each other."""
     probes = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if not one.name.endswith("_dot"))})
     window = simulate_window(Draw(probes, SEED, Purpose.EVALUATION, 21, layout=layout), 0)
     assert not LikelihoodFit(probes).diagnose(window).suspect
@@ -297,8 +297,8 @@ def probes_of_lab(layout: Layout) -> tuple[Machine, WindowStatistics]:
 @pytest.mark.parametrize(
     ("layout", "apart_us"), [(Layout.ONE_SOURCE, 30), (Layout.INDEPENDENT, 30), (Layout.ONE_SOURCE, 60)]
 )
-def test_a_converter_that_samples_one_channel_after_the_other_is_told(layout: Layout, apart_us: int) -> None:
-    """Its delays pass for damping: it was named, without reserve where independent forces shake the machine."""
+def test_a_converter_that_samples_channels_one_after_another_is_suspected(layout: Layout, apart_us: int) -> None:
+    """Its delays resemble damping, which used to be named, under independent forces even without reservation."""
     machine, window = probes_of_lab(layout)
     seen = late(machine, window, [1e-6 * apart_us * number for number in range(len(machine.sensors))])
     name, delay_us = told(machine, seen)
@@ -308,7 +308,7 @@ def test_a_converter_that_samples_one_channel_after_the_other_is_told(layout: La
 
 
 @pytest.mark.parametrize("at", [{}, {"y1": (45, 135), "y2": (30, 120)}])
-def test_a_channel_that_comes_late_is_told_however_it_is_mounted(at: dict[str, tuple[float, float]]) -> None:
+def test_a_delayed_channel_is_suspected_whatever_its_mounting(at: dict[str, tuple[float, float]]) -> None:
     lab, window = probes_of_lab(Layout.ONE_SOURCE)
     machine = mounted(lab, at)
     name, delay_us = told(machine, late(machine, window, [0.0, 0.0, 4e-5, 0.0, 0.0]))
@@ -316,7 +316,7 @@ def test_a_channel_that_comes_late_is_told_however_it_is_mounted(at: dict[str, t
     assert delay_us == pytest.approx(40, rel=0.15)
 
 
-def test_an_accelerometer_that_comes_late_is_told() -> None:
+def test_a_delayed_accelerometer_is_suspected() -> None:
     lab, window = probes_of_lab(Layout.ONE_SOURCE)
     sensors = [one.model_dump() for one in lab.sensors]
     sensors[2] |= {"quantity": "acceleration", "unit": "m/s2"}
@@ -343,14 +343,14 @@ def spectra(motion: FloatArray, noise: FloatArray, gains: tuple[float, float, fl
     return np.asarray(seen @ (motion * np.eye(2)) @ seen.conj().swapaxes(1, 2) + np.diag(noise * SCALE**2))
 
 
-def test_noise_of_equal_size_stays_one_and_white() -> None:
+def test_equal_sensor_noise_stays_white_with_unit_variance() -> None:
     motions = Motions(STATES, SCALE)
     assert motions.n == 2
     seen = motions.spectra(spectra(np.array(0.0), np.ones(3)), W)
     np.testing.assert_allclose(seen, np.broadcast_to(np.eye(2), seen.shape), atol=1e-12)
 
 
-def test_a_motion_holds_what_both_sensors_say_of_it() -> None:
+def test_a_motion_combines_the_information_of_both_its_sensors() -> None:
     """Its signal-to-noise ratio is the sum of the sensors' own: nothing is lost, nothing counted twice."""
     motions = Motions(STATES, SCALE)
     power = 1e-12
@@ -368,7 +368,7 @@ def test_shares_of_a_motion_add_up_to_one() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.0, 1.1])
-def test_a_wrong_gain_shows_in_the_rest_of_its_pair(gain: float) -> None:
+def test_a_wrong_gain_shows_as_a_mismatch_of_its_pair(gain: float) -> None:
     motions = Motions(STATES, SCALE)
     states = spectra(np.array(1e-10), np.full(3, 1e-3), gains=(1.0, 1.0, gain))
     (found,) = motions.mismatches(states, W, np.full(W.size, 11.0))

@@ -1,4 +1,4 @@
-"""Unbalance as a vector, a speed that varies, and accelerometers alone: what the likelihood reads then."""
+"""Likelihood readings of the unbalance vector, at varying speed, and from accelerometers alone."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,7 +32,7 @@ def drawn(number: int, e: float = 0.0, layout: Layout = Layout.INDEPENDENT) -> W
 
 
 def turned(window: WindowStatistics, degrees: float) -> WindowStatistics:
-    """The same window with the heavy spot elsewhere: what turns with the shaft leads by that much more."""
+    """The window with the heavy spot turned: its 1x vectors lead by that much more."""
     turn, hops = np.exp(1j * np.radians(degrees)), sure(window.hop_synchronous)
     return replace(window, synchronous=turn * sure(window.synchronous), hop_synchronous=turn * hops)
 
@@ -43,7 +43,7 @@ def e_of(window: WindowStatistics) -> tuple[Parameter, UnbalanceVector]:
 
 
 @pytest.mark.parametrize(("e", "degrees"), [(-0.5, -170.0), (0.0, 180.0), (1.0, 40.0)])
-def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: float, degrees: float) -> None:
+def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_zero(e: float, degrees: float) -> None:
     reading, vector = e_of(turned(drawn(1, e), degrees))
     assert vector.magnitude_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)
     apart = (sure(vector.turned_deg) - degrees + 180) % 360 - 180
@@ -52,7 +52,7 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: floa
     assert vector.change == pytest.approx(abs(true), abs=4.5 * vector.change_error + 0.01)
     assert reading.relative_change is not None
     assert reading.relative_change > -1
-    # As much of a change as there is, or of the size where the turn is the lesser part of it.
+    # The change of the vector, or that of its size where the turn is the lesser part.
     assert reading.relative_change == pytest.approx(
         abs(true) if abs(reading.relative_change - e) > 0.05 else e, abs=0.1
     )
@@ -60,7 +60,7 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: floa
 
 
 @pytest.mark.parametrize("removed_by_hop", [False, True])
-def test_once_the_angle_has_jumped_the_unbalance_is_judged_by_its_size(removed_by_hop: bool) -> None:
+def test_after_a_jump_of_the_angle_the_unbalance_is_judged_by_its_size(removed_by_hop: bool) -> None:
     for e in (0.0, 0.3):
         seen = turned(drawn(1, e), 90.0)
         reading, vector = e_of(replace(seen, directed=False, removed_by_hop=removed_by_hop))
@@ -70,8 +70,8 @@ def test_once_the_angle_has_jumped_the_unbalance_is_judged_by_its_size(removed_b
 
 
 @pytest.mark.slow
-def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
-    """The difference of two windows' vectors is their noise alone: which side of nothing it is on is chance."""
+def test_a_balanced_rotor_reads_a_loss_of_unbalance_of_less_than_all_of_it() -> None:
+    """The difference of two windows' vectors is noise alone, whose sign is chance."""
     draw = Draw(MACHINE, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT, fixed_condition=True)
     drawings = [simulate_window(draw, number) for number in range(3)]
     last = drawings.pop()
@@ -81,14 +81,14 @@ def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
         assert vector.turned_deg is None
 
 
-def test_an_angle_that_is_rounded_to_nothing_has_no_sign() -> None:
+def test_an_angle_rounded_to_zero_has_no_sign() -> None:
     vector = UnbalanceVector(1.5, -1e-3, 1e-8, 0.0, 1e-8)
     said = "a vector of 50 % of the nominal unbalance at 0° from the heavy spot (size +50 %, turned by 0°)"
     assert vector.sentence == said
     assert "(size +0 %, turned by −57°: the heavy spot" in UnbalanceVector(0.54, -0.84, 1e-8, 0.0, 1e-8).sentence
 
 
-def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
+def test_1x_vectors_that_no_unbalance_causes_are_not_read_as_one() -> None:
     window = drawn(2)
     foreign = np.abs(sure(window.synchronous)) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
     diagnosis = LikelihoodFit(MACHINE).diagnose(replace(window, synchronous=foreign))
@@ -99,8 +99,8 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     assert not verdict.outside
 
 
-def test_without_a_shaft_angle_vectors_at_any_angle_have_a_size() -> None:
-    """Of a shaft that turns either way; of what is no unbalance there is no reading, and no misfit."""
+def test_without_a_shaft_angle_the_size_of_the_unbalance_is_still_read() -> None:
+    """In either direction of rotation; vectors that no unbalance causes give no reading, and no misfit."""
     window, rng = drawn(2, 0.4), np.random.default_rng(5)
     seen = sure(window.hop_synchronous) * np.exp(1j * rng.uniform(0, 6, (12, 1)))
     foreign = np.abs(seen) * np.exp(1j * rng.uniform(0, 6, len(window.states)))
@@ -117,8 +117,8 @@ def test_without_a_shaft_angle_vectors_at_any_angle_have_a_size() -> None:
 
 
 @pytest.mark.parametrize(("number", "layout", "e"), [(4, Layout.INDEPENDENT, 0.0), (8, Layout.ONE_SOURCE, 0.4)])
-def test_run_out_is_no_more_of_an_unbalance_than_it_is(number: int, layout: Layout, e: float) -> None:
-    """Every sensor shows 1x that is 5 % off, in a direction of its own: weights of chance alone made it 23 and 14 %."""
+def test_run_out_biases_the_unbalance_by_no_more_than_its_own_size(number: int, layout: Layout, e: float) -> None:
+    """The 1x of each sensor is 5 % off in its own direction; weights by random error alone made it 23 and 14 %."""
     window = drawn(number, e, layout)
     off = 0.05 * np.exp(1j * np.random.default_rng(number).uniform(0, 2 * np.pi, len(window.states)))
     reading, vector = e_of(replace(window, synchronous=sure(window.synchronous) * (1 + off)))
@@ -127,8 +127,8 @@ def test_run_out_is_no_more_of_an_unbalance_than_it_is(number: int, layout: Layo
 
 
 @pytest.mark.parametrize("turn", [0.0, 60.0])
-def test_the_vector_is_as_large_as_what_is_read_of_a_window_astride_a_change(turn: float) -> None:
-    """Half of the window is from after the change: half of it is in the window's vector, and all of it is told."""
+def test_the_vector_of_a_window_across_a_change_has_the_size_that_is_read(turn: float) -> None:
+    """The change is in the middle of the window: its vector shows half of the change, the reading all of it."""
     new = 1.8 * np.exp(1j * np.radians(turn)) if not turn else np.exp(1j * np.radians(turn))
     half = (1 + new) / 2
     vector = UnbalanceVector(half.real, half.imag, 1e-6, 0.0, 1e-6)
@@ -144,9 +144,7 @@ def test_the_vector_is_as_large_as_what_is_read_of_a_window_astride_a_change(tur
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
 def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
-    """Size and direction of 8 windows: rms of all 16 z within 1 + 4/√32, of each alone within 1 + 4/√16, but for a
-    tenth.
-    """
+    """Size and direction of 8 windows: rms of all 16 z within 1 + 4/√32 and of each 8 within 1 + 4/√16, plus 0.1."""
     z = []
     for number in range(8):
         _, vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0))
@@ -175,7 +173,7 @@ def read(seed: int, ramp: float, *events: Event) -> Diagnosis:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ramp", [pytest.param(0.05, marks=pytest.mark.long), 0.15])
-def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
+def test_a_healthy_machine_at_varying_speed_reads_healthy(ramp: float) -> None:
     diagnosis = read(SEED_OF_VARYING_SPEED, ramp)
     assert len(diagnosis.evaluable) == 6
     assert all(abs(reading.z or 99.0) < 4 for reading in diagnosis.evaluable)
@@ -184,7 +182,7 @@ def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "change"), [("e", 0.2), pytest.param("c_by", -0.2, marks=pytest.mark.long)])
-def test_a_change_is_named_alone(name: str, change: float) -> None:
+def test_a_change_at_varying_speed_is_named_alone(name: str, change: float) -> None:
     diagnosis = read(SEED_OF_VARYING_SPEED + 1, 0.1, Event(at_s=0.0, parameter=name, relative_change=change))
     assert isolate_window(diagnosis, 0.001).changed == (name,)
     reading = next(one for one in diagnosis.evaluable if one.name == name)
@@ -225,7 +223,7 @@ def window() -> WindowStatistics:
     return windows_of(recording(accelerometers(), with_samples(blocks, samples)))[0]
 
 
-def test_accelerations_become_velocities(window: WindowStatistics) -> None:
+def test_accelerations_are_integrated_to_velocities(window: WindowStatistics) -> None:
     found = integrated(window)
     assert found.states == ("y1_dot", "y2_dot", "z1_dot", "z2_dot")
     true = windows_of(recording(LAB, stream(70.0, SEED_OF_INTEGRATED)))[0]

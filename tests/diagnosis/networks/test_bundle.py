@@ -33,7 +33,7 @@ SHIPPED = Path(__file__).parents[3] / "models" / "bundles" / "lab"
 MADE = Training(seed=SEED, training_windows=24, calibration_windows=10, versions={})
 
 
-def test_a_bundle_comes_back_as_it_was_saved_and_an_uncalibrated_one_is_not_saved(tmp_path: Path) -> None:
+def test_a_bundle_round_trips_and_an_uncalibrated_one_is_not_saved(tmp_path: Path) -> None:
     shipped = load_bundle("lab", LAB)
     assert shipped.amortised is not None
     saved = save_bundle(tmp_path / "bundle", LAB, shipped.networks, MADE, shipped.amortised)
@@ -62,7 +62,7 @@ def test_a_bundle_comes_back_as_it_was_saved_and_an_uncalibrated_one_is_not_save
         save_bundle(tmp_path, LAB, (EquationNetwork(trained.equation, trained.network, None),), MADE)
 
 
-def test_machines_of_one_kind_hold_the_weights_of_their_bundle_once(tmp_path: Path) -> None:
+def test_machines_with_the_same_bundle_share_its_weights(tmp_path: Path) -> None:
     copied = shutil.copytree(SHIPPED, tmp_path / "copy")
     one, other = (load_bundle(place, LAB.model_copy(update={"name": place.name})) for place in (SHIPPED, copied))
     ours, others = sure(one.amortised), sure(other.amortised)
@@ -212,12 +212,12 @@ def test_simulated_windows_look_like_drawn_ones() -> None:
         for layout in Layout:
             seen = sure(reader.inputs(window("", number, layout)))
             novelty.append(float(shipped().basis.novelty(seen[0])[0]))
-    # Training windows are one on average; the evaluation's are drawn less broadly.
+    # The novelty of training windows averages one; those of the evaluation are drawn less broadly.
     assert 0.2 < np.median(novelty) < 1.5
     assert max(novelty) < shipped().novelty_limit
 
 
-def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
+def test_force_features_hold_coherences_and_do_not_depend_on_the_level() -> None:
     features, draws = ForceFeatures(LAB), SpectralDraws(LAB)
     rng = np.random.default_rng(SEED_OF_AMORTISED + 1)
     while True:  # a machine that happens to be drawn near nominal, with independent sources
@@ -231,9 +231,9 @@ def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
     np.testing.assert_allclose(louder, series, atol=1e-4)  # levels drop out
 
 
-def test_forces_of_a_changed_machine_are_those_of_its_sources_once_it_is_known() -> None:
+def test_forces_of_one_source_are_in_phase_through_the_true_machine() -> None:
     draws, rng = SpectralDraws(LAB, near=True), np.random.default_rng(SEED_OF_AMORTISED + 2)
-    # One source: through the right machine all forces are in phase, but for what its tilting moment leaves.
+    # One source: through the right machine all forces are in phase, except for its tilting moment.
     while True:
         one = draws.draw(rng, 1)
         apart = one.log_ratio - one.centre
@@ -254,7 +254,7 @@ def test_forces_of_a_changed_machine_are_those_of_its_sources_once_it_is_known()
 
 
 @pytest.mark.slow
-def test_the_second_reading_is_sharper() -> None:
+def test_the_second_reading_is_more_precise() -> None:
     twice, once = (NetworkDiagnostician(LAB, one) for one in (shipped(), replace(shipped(), near=None)))
     errors, stated = [], []
     for layout, parameter, number in product(Layout, ("k_by", "k_bz"), range(4)):
@@ -269,7 +269,7 @@ def test_the_second_reading_is_sharper() -> None:
         assert second < 0.8 * first
 
 
-def test_the_first_reading_stands_where_the_second_was_not_trained() -> None:
+def test_the_first_reading_is_kept_where_the_second_was_not_trained() -> None:
     healthy, vague = window("", 0), shipped().networks[0]
     deaf = replace(vague, biases=(*vague.biases[:-1], vague.biases[-1] + np.array([0, 0, 5, 5, 0], dtype=np.float32)))
     amortised = replace(shipped(), networks=(deaf, *shipped().networks[1:]))
@@ -300,7 +300,7 @@ def test_the_shipped_networks_find_and_size_faults_on_new_windows(parameter: str
     assert np.mean(np.array(z_others) > 3.14) < 0.1
 
 
-def test_what_the_networks_cannot_judge_is_said_to_be_so() -> None:
+def test_networks_state_why_a_window_cannot_be_judged() -> None:
     reader = NetworkDiagnostician(LAB, shipped())
     healthy = window("", 0)
     assert len(reader.diagnose(healthy).evaluable) == len(PARAMETERS)
@@ -335,7 +335,7 @@ def test_tilt_sensors_beside_the_trained_ones_do_no_harm() -> None:
     assert len(diagnosis.evaluable) == len(PARAMETERS)
 
 
-def test_relations_speak_the_common_language() -> None:
+def test_relation_networks_give_a_diagnosis_of_the_common_form() -> None:
     bundle = load_bundle("lab", LAB)
     diagnosis = RelationDiagnostician(LAB, bundle.networks).diagnose(window("", 0))
     assert diagnosis.by == "relation"

@@ -44,7 +44,7 @@ def test_an_equation_reads_its_own_parameters_alone(equation: Equation | Synchro
     for changed_name in PARAMETERS:
         own = changed_name in equation.parameters
         if changed_name in equation.kept_nominal and not own:
-            continue  # the shaft stands in equation 29 too; nothing is claimed then
+            continue  # the shaft enters equation 29 too; nothing is claimed then
         for size in (-0.2, 0.1):
             rows = equation.rows(theory(machine, {changed_name: size}, 1.05), machine)
             read = np.linalg.lstsq(rows.signatures, rows.target - rows.inputs @ weights, rcond=None)[0]
@@ -53,7 +53,7 @@ def test_an_equation_reads_its_own_parameters_alone(equation: Equation | Synchro
 
 
 @pytest.mark.parametrize("name", ["lab", "heavy"])
-def test_it_is_known_what_a_changed_shaft_looks_like_to_the_equation_of_the_unbalance(name: str) -> None:
+def test_a_shaft_change_taken_for_unbalance_has_the_predicted_size(name: str) -> None:
     machine, equation = load_machine(name), EQUATIONS[1]
     assert isinstance(equation, SynchronousEquation)
     weights = linear_relation(equation, machine)
@@ -62,7 +62,7 @@ def test_it_is_known_what_a_changed_shaft_looks_like_to_the_equation_of_the_unba
     assert 0.01 * equation.taken_for(machine)["EI"] == pytest.approx(float(read[0]), rel=0.15)
 
 
-def test_equations_do_not_depend_on_unmeasured_states() -> None:
+def test_the_missing_states_of_each_equation_are_listed() -> None:
     lab = load_machine("lab").descriptor.states
     absent = {equation.number: missing(equation, lab) for equation in EQUATIONS}
     assert absent == {"28": (), "29": (), "30": ("psi_dot", "psi", "phi_dot"), "31": ()}
@@ -84,7 +84,7 @@ def test_targets_and_inputs_are_taken_at_the_same_lag() -> None:
             )
 
 
-def test_a_network_is_its_perceptron_however_large_its_inputs() -> None:
+def test_a_network_computes_its_perceptron_for_inputs_of_any_size() -> None:
     rng = np.random.default_rng(20260701)
     scale, W1, b1 = rng.uniform(1, 2, 4), rng.normal(size=(4, 15)), rng.normal(size=15)
     W2, b2 = rng.normal(size=15), rng.normal(size=1)

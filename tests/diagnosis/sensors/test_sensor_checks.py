@@ -38,7 +38,7 @@ def plan_of(name: str, *, displacements: bool = False) -> Plan:
 
 
 def of_displacements(samples: FloatArray) -> FloatArray:
-    """Of the rotor kit's, and the shaft angle."""
+    """The displacements of the rotor kit and the shaft angle."""
     return samples[:, [*(column(state) for state in DISPLACEMENTS), -1]]
 
 
@@ -120,7 +120,7 @@ def test_healthy_sensors_are_left_alone_under_any_excitation(name: str, one_sour
 
 
 @pytest.mark.parametrize("state", ["y1", "z2_dot"])
-def test_a_stuck_sensor_is_named_with_its_value_and_for_how_long(state: str) -> None:
+def test_a_stuck_sensor_is_named_with_its_value_and_duration(state: str) -> None:
     samples = recorded("lab", 1).copy()
     samples[50_000:110_000, column(state)] = samples[50_000, column(state)]
     finding = only(found_in(samples))
@@ -130,26 +130,26 @@ def test_a_stuck_sensor_is_named_with_its_value_and_for_how_long(state: str) -> 
     assert f"{samples[50_000, column(state)] / channel.to_si:.3g} {unit_in_text(channel.unit)}" in finding.text
 
 
-def test_a_sensor_that_has_just_stuck_is_named_without_a_value_that_it_never_had() -> None:
+def test_a_sensor_that_has_just_stuck_is_named_without_a_value() -> None:
     samples = recorded("lab", 1).copy()
     samples[122_000:, column("y1")] = samples[122_000, column("y1")]  # the mean of its hop is another value
     assert "y1: repeated one value for 1.5 s" in only(found_in(samples)).text
 
 
 @pytest.mark.parametrize("state", ["y1", "z1"])
-def test_a_sensor_that_shows_nothing_at_all_is_named(state: str) -> None:
+def test_a_sensor_without_any_signal_is_named_as_stuck(state: str) -> None:
     found = found_in(spoilt(state, np.zeros_like))
     assert ("stuck", (state,)) in [(finding.kind, finding.states) for finding in found]
 
 
-def test_a_shaft_angle_that_does_not_turn_is_named() -> None:
+def test_a_shaft_angle_that_stops_turning_is_named_as_stuck() -> None:
     samples = recorded("lab", 1).copy()
     samples[80_000:, -1] = samples[80_000, -1]
     assert ("theta",) in [finding.states for finding in found_in(samples) if finding.kind == "stuck"]
 
 
-def test_steps_of_a_converter_are_no_fault() -> None:
-    """Sixteen bits over a range ten times the motion, and twelve."""
+def test_quantisation_steps_are_no_fault() -> None:
+    """Converters of 16 and 12 bits over a range of ±10 times the rms."""
     samples = recorded("lab", 1).copy()
     for step_parts in (2**16 / 20, 2**12 / 20):
         step = samples[:, :8].std(axis=0) / step_parts
@@ -159,7 +159,7 @@ def test_steps_of_a_converter_are_no_fault() -> None:
 
 
 @pytest.mark.parametrize(("also", "every"), [((), 5_000), ((), 25_000), (("y2_dot",), 5_000)])
-def test_peaks_that_are_no_motion_are_named(also: tuple[str, ...], every: int) -> None:
+def test_peaks_that_the_paired_sensor_does_not_show_are_named(also: tuple[str, ...], every: int) -> None:
     samples = recorded("lab", 1).copy()
     for name in ("y2", *also):
         samples[::every, column(name)] += 20 * samples[:, column(name)].std()
@@ -173,7 +173,7 @@ def test_peaks_that_are_no_motion_are_named(also: tuple[str, ...], every: int) -
 
 
 @pytest.mark.parametrize(("state", "gap"), [("y1", 0.0), ("z2", 40.0), ("y2_dot", 0.0)])
-def test_a_channel_that_drops_out_again_and_again_has_a_loose_connector(state: str, gap: float) -> None:
+def test_repeated_dropouts_are_reported_as_jumps_to_a_constant(state: str, gap: float) -> None:
     samples = recorded("lab", 1).copy()
     own = samples[:, column(state)]
     own += gap * own.std()  # a probe's distance from the shaft
@@ -183,12 +183,12 @@ def test_a_channel_that_drops_out_again_and_again_has_a_loose_connector(state: s
     assert (finding.kind, finding.states) == ("stuck", (state,))
     assert f"{state}: jumps to a constant and back, for 0." in finding.text
     few = recorded("lab", 1).copy()
-    few[60_000:60_040, column(state)] = 0.0  # once in a window matters to nothing
+    few[60_000:60_040, column(state)] = 0.0  # a single dropout does not matter
     assert found_in(few) == ()
 
 
 @pytest.mark.parametrize("kind", ["few digits", "8 bits", "held", "impulses on a coarse converter"])
-def test_runs_of_equal_samples_that_are_no_break(kind: str) -> None:
+def test_quantised_or_held_samples_are_no_dropouts(kind: str) -> None:
     samples = recorded("lab", 1).copy()
     rng, own = np.random.default_rng(1611), samples[:, 0]
     spread = own.std()
@@ -210,7 +210,7 @@ def test_runs_of_equal_samples_that_are_no_break(kind: str) -> None:
         ("", np.unwrap), ("", lambda theta: np.mod(np.unwrap(theta), 20 * np.pi)),
     ],
 )  # fmt: skip
-def test_what_is_no_angle_in_radians_is_told(bounds: str, angle: Callable[[FloatArray], FloatArray]) -> None:
+def test_a_shaft_angle_that_is_not_in_radians_is_named(bounds: str, angle: Callable[[FloatArray], FloatArray]) -> None:
     samples = recorded("lab", 1).copy()
     samples[:, -1] = angle(samples[:, -1])
     told = [finding.text for finding in found_in(samples) if finding.states == ("theta",) and "2π" in finding.text]
@@ -275,7 +275,7 @@ def test_a_step_of_the_mean_is_an_offset_and_a_slow_drift_is_allowed() -> None:
     assert sure(finding.z) > 8
 
 
-def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_none() -> None:
+def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_no_offset() -> None:
     samples, at = recorded("lab", 1).copy(), column("y1")
     samples[:, at] += 1e-3
     assert found_in(samples) == ()
@@ -284,8 +284,8 @@ def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_none(
     assert found_in(samples, reference_of("lab")) == ()
 
 
-def test_sensors_that_always_disagreed_are_healthy_and_a_new_gain_is_the_channels() -> None:
-    """Commissioned with a velocity 4 % too large and 0.2 ms late; then the displacement loses a tenth."""
+def test_a_mismatch_at_commissioning_is_healthy_and_a_new_gain_error_is_named() -> None:
+    """Commissioned with a velocity 4 % too large; then the displacement loses a fifth."""
     usual = np.ones(9)
     usual[column("y1_dot")] = 1.04
     reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 900, 2) * usual))
@@ -298,7 +298,7 @@ def test_sensors_that_always_disagreed_are_healthy_and_a_new_gain_is_the_channel
 
 
 def coupled(samples: FloatArray, states: tuple[str, ...], corner_hz: float) -> FloatArray:
-    """Samples of which some channels come from behind a high-pass of first order."""
+    """The samples with some channels behind a first-order high-pass."""
     numerator, denominator = butter(1, corner_hz, "highpass", fs=2000.0)
     found, columns = samples.copy(), [column(state) for state in states]
     found[:, columns] = lfilter(numerator, denominator, samples[:, columns], axis=0)
@@ -309,11 +309,11 @@ RATES = ("y1_dot", "z1_dot", "y2_dot", "z2_dot")
 
 
 @pytest.mark.parametrize("states", [RATES, DISPLACEMENTS])
-def test_a_sensor_that_is_ac_coupled_is_not_late(states: tuple[str, ...]) -> None:
+def test_an_ac_coupled_sensor_is_not_reported_as_delayed(states: tuple[str, ...]) -> None:
     assert found_in(coupled(recorded("lab", 1), states, 1.0)) == ()
 
 
-def test_beside_ac_coupling_a_delay_is_found_with_its_size() -> None:
+def test_a_delay_is_found_with_its_size_despite_ac_coupling() -> None:
     healthy = coupled(recorded("lab", 900, 2), RATES, 1.0)
     reference = learn_sensor_reference(windows_of(plan_of("lab"), healthy))
     assert [pair.lead_rad_s for pair in reference.pairs] == pytest.approx([2 * np.pi] * 4, rel=0.05)
@@ -327,7 +327,7 @@ def test_beside_ac_coupling_a_delay_is_found_with_its_size() -> None:
 
 
 @pytest.mark.parametrize("state", ["y2_dot", "z1"])
-def test_a_corner_that_is_too_high_is_told_as_one(state: str) -> None:
+def test_an_ac_coupling_corner_that_is_too_high_is_named(state: str) -> None:
     finding = only(found_in(coupled(recorded("lab", 1), (state,), 2.0)))
     assert (finding.kind, finding.states) == ("delay", (state,))
     assert f"{state}: runs ahead of" in finding.text
@@ -363,7 +363,7 @@ def test_the_reference_comes_back_from_json_bit_for_bit() -> None:
         SensorReference.model_validate(broken, strict=False)
 
 
-def test_nothing_to_learn_from_says_so() -> None:
+def test_a_reference_without_usable_healthy_windows_is_an_error() -> None:
     with pytest.raises(EstimationError, match="no healthy window"):
         learn_sensor_reference([])
     with pytest.raises(EstimationError, match="no fluctuation in y1"):
@@ -373,7 +373,7 @@ def test_nothing_to_learn_from_says_so() -> None:
 @pytest.mark.parametrize(
     ("state", "why"), [("y1", "either its gain jumped or the stiffness of that bearing did"), ("y2", "its gain jumped")]
 )
-def test_what_jumps_at_a_bearing_alone_may_be_the_bearing(state: str, why: str) -> None:
+def test_a_gain_jump_at_a_bearing_alone_may_be_the_bearing_stiffness(state: str, why: str) -> None:
     plan, samples = plan_of("lab", displacements=True), of_displacements(recorded("lab", 1))
     samples[70_000:, plan.states.index(state)] *= 1.5
     (window,) = windows_of(plan, samples)
@@ -383,8 +383,8 @@ def test_what_jumps_at_a_bearing_alone_may_be_the_bearing(state: str, why: str) 
 
 
 @pytest.mark.slow
-def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() -> None:
-    """Found where the 1x part stands out enough, and never put down to another channel."""
+def test_with_displacements_alone_a_gain_jump_in_one_channel_is_found() -> None:
+    """Found where the 1x part stands out enough, and never attributed to another channel."""
     plan = plan_of("lab", displacements=True)
     found: list[float] = []
     for seed in (1, 23, 24):
@@ -400,7 +400,7 @@ def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() ->
     np.testing.assert_allclose(found, -0.3, atol=0.1)
 
 
-def test_a_machine_that_sinks_into_the_noise_of_its_sensors_has_no_gain_that_drifts() -> None:
+def test_a_signal_fading_into_sensor_noise_is_no_gain_drift() -> None:
     plan, samples = plan_of("lab"), recorded("lab", 31).copy()
     moving = samples[:, : len(plan.states)]
     mean, rms = moving.mean(axis=0), moving.std(axis=0)
@@ -410,8 +410,8 @@ def test_a_machine_that_sinks_into_the_noise_of_its_sensors_has_no_gain_that_dri
     assert found_in(samples) == found_in(samples, reference_of("lab")) == ()
 
 
-def test_a_line_of_the_machine_that_begins_where_sensors_showed_noise_is_no_gain_that_drifts() -> None:
-    """As of a gear that begins to whine: a displacement hardly shows it, and shows it alone from then on."""
+def test_a_line_that_begins_where_sensors_showed_noise_is_no_gain_drift() -> None:
+    """Such as a gear that begins to whine: a displacement hardly shows it, and shows it alone from then on."""
     plan, samples = plan_of("lab"), recorded("lab", 31).copy()
     at_s, omega = np.arange(len(samples)) / plan.rate_hz, 2 * np.pi * 120.0
     for place in ("y1", "z1", "y2", "z2"):
@@ -423,8 +423,8 @@ def test_a_line_of_the_machine_that_begins_where_sensors_showed_noise_is_no_gain
 
 
 @pytest.mark.parametrize(("seed", "one_source"), [(5, True), (24, False)])
-def test_a_channel_that_begins_to_come_late_has_no_wrong_gain_besides(seed: int, *, one_source: bool) -> None:
-    """Of two delays in turn, the mean of the transfer is smaller than either."""
+def test_a_channel_that_becomes_delayed_has_no_gain_error_besides(seed: int, *, one_source: bool) -> None:
+    """The mean transfer function of two successive delays is smaller than either's."""
     plan, samples = plan_of("lab"), recorded("lab", seed, one_source=one_source).copy()
     column, late, start = plan.states.index("y2_dot"), round(4e-3 * plan.rate_hz), round(15 * plan.rate_hz)
     samples[start:, column] = samples[start - late : -late, column]
@@ -434,7 +434,7 @@ def test_a_channel_that_begins_to_come_late_has_no_wrong_gain_besides(seed: int,
 
 @pytest.mark.parametrize("state", ["y1", "y1_dot"])
 @pytest.mark.parametrize(("from_s", "part"), [(50.0, 0.5), (25.0, 0.5), (25.0, 1.0)])
-def test_noise_that_begins_in_one_channel_is_no_gain_that_drifts(state: str, from_s: float, part: float) -> None:
+def test_noise_that_begins_in_one_channel_is_no_gain_drift(state: str, from_s: float, part: float) -> None:
     plan, samples = plan_of("lab"), recorded("lab", 31).copy()
     noisy = samples[round(from_s * plan.rate_hz) :, plan.states.index(state)]
     noisy += part * noisy.std() * np.random.default_rng([31, 9]).standard_normal(noisy.size)
@@ -442,7 +442,7 @@ def test_noise_that_begins_in_one_channel_is_no_gain_that_drifts(state: str, fro
     assert kinds <= {"noise", "incoherent"}
 
 
-def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
+def test_an_increase_of_all_vibration_is_no_sensor_fault() -> None:
     samples = of_displacements(recorded("lab", 23))
     samples[70_000:, :4] *= 1.5
     (window,) = windows_of(plan_of("lab", displacements=True), samples)
@@ -450,7 +450,7 @@ def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
 
 
 @pytest.mark.parametrize(("factor", "told"), [(2.0, "too many pulses"), (0.5, "pulses are missing")])
-def test_an_angle_of_another_speed_is_named_with_what_the_pulses_do(factor: float, told: str) -> None:
+def test_a_shaft_angle_at_the_wrong_speed_is_named_with_the_pulse_fault(factor: float, told: str) -> None:
     samples = recorded("lab", 1).copy()
     samples[:, -1] = factor * np.unwrap(samples[:, -1]) % (2 * np.pi)
     (finding,) = [one for one in found_in(samples, reference_of("lab")) if one.states == ("theta",)]
@@ -458,7 +458,7 @@ def test_an_angle_of_another_speed_is_named_with_what_the_pulses_do(factor: floa
 
 
 def test_a_1x_that_passes_through_zero_is_no_fault_of_the_angle() -> None:
-    """As where a bow grows opposite to the unbalance: over the window nothing of it is left on average."""
+    """Such as where a bow grows opposite to the unbalance: the 1x vector averages to zero over the window."""
     samples = recorded("lab", 1).copy()
     turns, moving = np.exp(1j * samples[:, -1]), samples[:, :-1]
     grown = np.interp(np.arange(len(samples)) / plan_of("lab").rate_hz, [20.0, 45.0], [0.0, 2.0])
@@ -466,8 +466,8 @@ def test_a_1x_that_passes_through_zero_is_no_fault_of_the_angle() -> None:
     assert "theta" not in implicated(found_in(samples, reference_of("lab")))
 
 
-def test_what_a_sensor_shows_of_the_other_plane_is_no_delay() -> None:
-    """One force moves both planes, so that it is in the transfer; two sensors were told as 0.13 ms late."""
+def test_cross_talk_from_the_other_plane_is_no_delay() -> None:
+    """One force moves both planes, so that cross-talk enters the transfer: two sensors were reported 0.13 ms late."""
     samples, states = recorded("heavy", 1, one_source=True).copy(), plan_of("heavy").states
     for state, other in (("z1_dot", "y1_dot"), ("y2", "z2")):
         samples[:, states.index(state)] += 0.02 * samples[:, states.index(other)]
@@ -476,7 +476,7 @@ def test_what_a_sensor_shows_of_the_other_plane_is_no_delay() -> None:
 
 
 @pytest.mark.parametrize(("ppm", "speed"), [(400.0, "slow"), (-400.0, "fast")])
-def test_sensors_on_a_clock_of_their_own_are_told_once_it_runs_apart(ppm: float, speed: str) -> None:
+def test_sensors_on_a_drifting_clock_are_reported_with_the_drift(ppm: float, speed: str) -> None:
     samples = recorded("lab", 1).copy()
     at = np.arange(len(samples), dtype=np.float64)
     late = np.minimum(at + np.maximum(0, at - 40_000) * ppm * 1e-6, at[-1])
@@ -489,7 +489,7 @@ def test_sensors_on_a_clock_of_their_own_are_told_once_it_runs_apart(ppm: float,
     assert float(finding.text.split()[-3]) == pytest.approx(abs(ppm), rel=0.15)
 
 
-def test_a_plane_that_turns_is_no_clock() -> None:
+def test_a_phase_drift_of_one_plane_is_no_clock_drift() -> None:
     samples = recorded("lab", 1).copy()
     at = np.arange(len(samples), dtype=np.float64)
     for state in ("y1", "y1_dot", "y2", "y2_dot"):  # as where a resonance of one plane passes the speed

@@ -1,4 +1,4 @@
-"""Noise that rises in one sensor is found and put down to it; a shaft angle that cannot be believed is named."""
+"""Noise that rises in one sensor is found and attributed to it; a faulty shaft angle is named."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -54,7 +54,7 @@ def windows_of(name: str, samples: FloatArray, *, displacements: bool = False) -
 
 @cache
 def reference_of(name: str, *, displacements: bool = False) -> SensorReference:
-    """Learned with one source: what moves the machine later is another matter."""
+    """Learned under one source; the excitation may differ later."""
     samples = recorded(name, 900, 2, directions=1)
     return learn_sensor_reference(windows_of(name, samples, displacements=displacements))
 
@@ -74,7 +74,7 @@ def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> F
 
 
 def with_hum(samples: FloatArray, state: str, part: float, line_hz: float = 50.0) -> FloatArray:
-    """A line, its rms a part of the channel's."""
+    """The samples with a line whose rms is a part of the channel's."""
     humming, at = samples.copy(), column(state)
     t_s = np.arange(len(samples)) / load_machine("lab").rate_hz
     humming[:, at] += part * samples[:, at].std() * np.sqrt(2) * np.sin(2 * np.pi * line_hz * t_s)
@@ -82,7 +82,7 @@ def with_hum(samples: FloatArray, state: str, part: float, line_hz: float = 50.0
 
 
 def in_band(part: float) -> float:
-    """Of white noise of this size, what lies in the band, over the rms of channel and noise."""
+    """The in-band rms of white noise of this size, relative to the rms of channel and noise together."""
     low, high = load_machine("lab").window.band_hz
     return float(part * np.sqrt((high - low) / (load_machine("lab").rate_hz / 2)) / np.hypot(1, part))
 
@@ -101,7 +101,7 @@ def test_healthy_sensors_are_quiet_under_another_excitation(name: str, displacem
     ("state", "part", "displacements"),
     [
         *((state, 0.3, False) for state in ("y1", "z2", "z1_dot", "y2_dot")),
-        *((state, 0.8, True) for state in ("y2", "z2")),  # of one sensor it has to lie over the machine
+        *((state, 0.8, True) for state in ("y2", "z2")),  # without its pair, noise must exceed the vibration
     ],
 )
 def test_the_noisy_sensor_is_named_with_its_noise(state: str, part: float, displacements: bool) -> None:
@@ -120,12 +120,12 @@ def test_mains_hum_in_one_channel_is_noise(displacements: bool) -> None:
 
 
 @pytest.mark.parametrize(("line_hz", "hums"), [(60.0, True), (100.2, True), (3 * 22.0, False), (87.3, False)])
-def test_a_line_that_one_sensor_sees_is_the_mains_or_the_machines(line_hz: float, hums: bool) -> None:
+def test_a_line_in_one_sensor_is_noise_only_at_mains_frequencies(line_hz: float, hums: bool) -> None:
     found = found_in(with_hum(recorded("lab", 920), "z2", 0.1, line_hz), displacements=True)
     assert [(one.kind, one.states) for one in found] == ([("noise", ("z2",))] if hums else [])
 
 
-def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() -> None:
+def test_a_mains_line_in_all_channels_is_no_sensor_noise() -> None:
     samples = recorded("lab", 920).copy()
     t_s = np.arange(len(samples)) / load_machine("lab").rate_hz
     for place, size in zip(DISPLACEMENTS, (0.05, 0.1, 0.15, 0.1), strict=True):
@@ -133,7 +133,7 @@ def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() ->
     assert found_in(samples, displacements=True) == ()
 
 
-def test_noise_that_rises_in_all_channels_is_no_single_sensors() -> None:
+def test_noise_that_rises_in_all_channels_is_no_sensor_fault() -> None:
     samples = recorded("lab", 920)
     assert found_in(with_noise(samples, "y1", 0.04)) == ()  # not worth a finding
     assert only(found_in(with_noise(samples, "y1", 0.25))).kind == "noise"
@@ -151,12 +151,12 @@ def test_noise_that_rises_in_all_channels_is_no_single_sensors() -> None:
         (927, Event(at_s=25.0, ramp_s=10.0, speed_rpm=1.03 * load_machine("lab").operation.speed_rpm)),
     ],
 )
-def test_a_fault_of_the_machine_or_another_speed_is_none_of_its_sensors(seed: int, event: Event) -> None:
+def test_a_machine_fault_or_speed_change_is_no_sensor_fault(seed: int, event: Event) -> None:
     samples = recorded("lab", seed, events=(event,))
     assert found_in(samples) == found_in(samples, displacements=True) == ()
 
 
-def test_without_a_reference_of_noise_none_is_found_and_an_old_reference_stays_as_it_was() -> None:
+def test_noise_needs_a_noise_reference_and_older_references_stay_valid() -> None:
     noisy = with_noise(recorded("lab", 920), "y1", 0.2)
     (window,) = windows_of("lab", noisy)
     assert sensor_findings(window) == ()
@@ -169,7 +169,7 @@ def test_without_a_reference_of_noise_none_is_found_and_an_old_reference_stays_a
     assert found_in(noisy)[0].kind == "noise"
 
 
-def test_a_reference_of_noise_comes_back_and_is_checked() -> None:
+def test_a_noise_reference_round_trips_and_is_validated() -> None:
     reference = reference_of("lab")
     again = SensorReference.model_validate_json(reference.model_dump_json())
     assert again == reference
@@ -212,7 +212,7 @@ def jittering(theta: FloatArray) -> FloatArray:
         (of_another_shaft, "incoherent", 0.8, False), (jittering, "noise", 0.8, False), (jittering, "noise", 0.8, True),
     ],
 )  # fmt: skip
-def test_a_wrong_angle_is_named(
+def test_a_faulty_shaft_angle_is_named(
     spoilt: Callable[[FloatArray], FloatArray], kind: str, value: float, displacements: bool
 ) -> None:
     samples = recorded("lab", 920).copy()
@@ -223,7 +223,7 @@ def test_a_wrong_angle_is_named(
 
 
 def test_a_heavy_spot_that_turns_is_no_fault_of_the_angle() -> None:
-    """The vectors turn together as where the angle jumps, but the angle goes on; over a gap nobody knows."""
+    """The 1x vectors turn as when the angle jumps, but the angle is continuous; over a gap this is unknown."""
     samples = recorded("lab", 921).copy()
     n, theta, after = samples.shape[1] - 1, samples[:, -1], round(0.55 * len(samples))
     turning = np.stack([np.cos(theta), np.sin(theta)], axis=1)
@@ -238,7 +238,7 @@ def test_a_heavy_spot_that_turns_is_no_fault_of_the_angle() -> None:
 
 
 @pytest.mark.parametrize("part", [0.1, 0.5, 0.7])
-def test_signs_of_all_sensors_that_are_reversed_are_told_as_long_as_the_window_holds_both(part: float) -> None:
+def test_reversed_signs_of_all_sensors_are_found_while_the_window_holds_both(part: float) -> None:
     samples = recorded("lab", 921).copy()
     samples[round(part * len(samples)) :, :-1] *= -1
     (finding,) = [one for one in found_in(samples) if one.states == ("theta",)]
@@ -247,7 +247,7 @@ def test_signs_of_all_sensors_that_are_reversed_are_told_as_long_as_the_window_h
     assert "the signs of all sensors were reversed" in finding.text
 
 
-def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> None:
+def test_a_small_jump_of_the_angle_is_found_in_loud_vibration() -> None:
     samples, machine = recorded("lab", 922).copy(), load_machine("lab")
     shaking = np.fft.rfft(np.random.default_rng(923).standard_normal(samples[:, :-1].shape), axis=0)
     f = np.fft.rfftfreq(len(samples), 1 / machine.rate_hz)
@@ -262,7 +262,7 @@ def test_a_small_jump_in_loud_vibration_is_found_where_the_angle_shows_it() -> N
 
 @pytest.mark.parametrize(("wanders", "resonance"), [(0.0, 1.0), (0.0, 1.01), (0.01, 1.0), (0.01, 1.2)])
 @pytest.mark.parametrize("damping", [0.002, 0.01])
-def test_a_shaft_near_a_narrow_resonance_has_a_sound_angle(wanders: float, resonance: float, damping: float) -> None:
+def test_a_resonance_near_the_speed_is_no_fault_of_the_angle(wanders: float, resonance: float, damping: float) -> None:
     rng, plan = np.random.default_rng([60120, round(1e4 * damping), round(100 * resonance)]), plan_of("lab")
     plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
     machine = load_machine("lab")

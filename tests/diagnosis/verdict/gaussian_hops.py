@@ -14,7 +14,7 @@ from rotorwatch.records.windows import Verdict
 
 @dataclass(frozen=True, slots=True)
 class DelayStudy:
-    """Of independent trials: from the change to the hop at which it was detected, and named alone, or infinity.
+    """Delays in independent trials from the change to the hop that detected it, and named it alone, or infinity.
 
     `wrong` trials name at some hop a parameter that did not change; `early` ones detect something before the change,
     and take no part in the delays.
@@ -67,7 +67,7 @@ def true(**changes: float) -> FloatArray:
 
 
 def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]) -> list[tuple[int, Verdict]]:
-    """Verdicts and their hops, of so many hops with these true values and then so many with those."""
+    """Verdicts with their hop numbers, for a story of numbers of hops and their true values."""
     verdicts, number = [], 0
     for count, values in story:
         for _ in range(count):
@@ -83,7 +83,7 @@ def detection_delays(
     settings: SequentialSettings, covariance: FloatArray, changes: Mapping[str, float], *, trials: int, seed: int,
     before_hops: int, after_hops: int,
 ) -> DelayStudy:  # fmt: skip
-    """Play relative changes that step at random moments within a hop, after so many healthy hops."""
+    """Play relative changes that step at a random moment within a hop, after `before_hops` healthy hops."""
     step, detected, named = true(**changes), [], []
     wrong = early = 0
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(trials)):

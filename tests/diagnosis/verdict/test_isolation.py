@@ -1,4 +1,4 @@
-"""The choice among sets of parameters, two diagnosticians on one window, and what a reading says of itself."""
+"""The choice among sets of changed parameters, agreement of two diagnosticians, and invalid readings."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_one_or_two_faults_are_named_exactly(changed: int) -> None:
 
 
 @pytest.mark.parametrize("changed", [3, 6])
-def test_more_than_two_are_nameable(changed: int) -> None:
+def test_more_than_two_changes_can_be_named(changed: int) -> None:
     rng = np.random.default_rng(SEED + changed)
     hits = [true == set(found.changed) for true, found in (draw(rng, changed, 0.01, 9.0) for _ in range(150))]
     assert np.mean(hits) > 0.98
@@ -109,7 +109,7 @@ def test_changes_that_hide_each_other_in_single_tests_are_found_together() -> No
 
 
 @pytest.mark.parametrize(("first", "second", "found"), [(4.7, 4.7, True), (4.7, 4.0, False)])
-def test_two_that_chance_makes_alone_but_not_together_have_changed(first: float, second: float, found: bool) -> None:
+def test_two_changes_below_the_single_threshold_may_pass_jointly(first: float, second: float, found: bool) -> None:
     thresholds = month_thresholds(1.0, 5.0, 12, len(PARAMETERS), 10)
     assert first < thresholds.first
     seen = window(1e-3 * np.array([0.0, first, 0.0, second, 0.0, 0.0]), np.diag(np.full(6, 1e-6)))
@@ -119,7 +119,7 @@ def test_two_that_chance_makes_alone_but_not_together_have_changed(first: float,
     assert {PARAMETERS[i] for i in likeliest} == {"c_by", "c_bz"}
 
 
-def test_the_restricted_estimate_is_sharper_and_right() -> None:
+def test_the_restricted_estimate_is_more_precise_and_unbiased() -> None:
     rng = np.random.default_rng(SEED + 60)
     cov = np.diag(np.full(6, 1e-4))
     cov[0, 1] = cov[1, 0] = 0.8e-4
@@ -135,7 +135,7 @@ def test_the_restricted_estimate_is_sharper_and_right() -> None:
     assert abs(float(np.mean(z))) < 0.2
 
 
-def test_outside_the_model_is_a_verdict_of_its_own() -> None:
+def test_outside_the_model_is_a_separate_verdict() -> None:
     cov = np.diag(np.full(6, 1e-4))
     quiet, loud = (isolate_window(window(np.zeros(6), cov, misfit_z=z), 0.01) for z in (1.0, 5.0))
     assert (quiet.outside, quiet.low_confidence) == (False, False)
@@ -188,8 +188,8 @@ def test_agreement_disagreement_and_only_one() -> None:
 
 
 @pytest.mark.parametrize("common", [1, 6])
-def test_two_who_are_right_disagree_once_in_a_thousand_windows(common: int) -> None:
-    """About any parameter, if what they read of each is independent."""
+def test_two_unbiased_estimators_disagree_once_in_a_thousand_windows(common: int) -> None:
+    """Over all parameters together, if their readings are independent."""
     limit = float(norm.isf((1 - 0.999 ** (1 / common)) / 2)) * np.hypot(0.01, 0.03)
     for apart, verdict in ((0.999 * limit, "agree"), (1.001 * limit, "disagree")):
         one, other = (dict.fromkeys(PARAMETERS[:common], reading) for reading in ((0.0, 0.01), (apart, 0.03)))
@@ -198,29 +198,29 @@ def test_two_who_are_right_disagree_once_in_a_thousand_windows(common: int) -> N
 
 
 @pytest.mark.parametrize("freedom", [3.0, 12.0, 100.0])
-def test_few_degrees_of_freedom_do_not_make_them_disagree_more_often(freedom: float) -> None:
-    """Whatever the tails are, one in a thousand lies beyond; the 95 % interval is that of the standard error."""
+def test_few_degrees_of_freedom_do_not_raise_the_rate_of_disagreement(freedom: float) -> None:
+    """Whatever the tails, one in a thousand lies beyond; the standard error gives the 95 % interval."""
     scale = 0.03 * norm.isf(0.025) / student.isf(0.025, freedom)
     limit = float(student.isf(0.0005, freedom)) * scale
     for apart, verdict in ((0.999 * limit, "agree"), (1.001 * limit, "disagree")):
         second = replace(diagnosis("relation", k_by=(apart, 0.03)), freedom={"k_by": freedom})
         (found,) = agreements(diagnosis("likelihood", k_by=(0.0, 1e-6)), second)
         assert found.verdict == verdict
-        # Beside a likelihood whose error is much the larger, tails are normal.
+        # If the error of the likelihood is much larger, tails are normal.
         (wide,) = agreements(diagnosis("likelihood", k_by=(0.0, 3.0)), second)
         assert wide.difference_z == pytest.approx(apart / 3.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("rate", [0.01, 0.001])
-def test_few_degrees_of_freedom_do_not_make_a_window_changed_more_often(rate: float) -> None:
-    """In the scale in which a change of k and of its inverse weigh the same, about: errors are small."""
+def test_few_degrees_of_freedom_do_not_raise_the_rate_of_changed_windows(rate: float) -> None:
+    """Approximately, as errors are small, on the scale in which changes of k and of 1/k weigh the same."""
     limit = float(student.isf(rate / 2, 5.0)) * 1e-4 * norm.isf(0.025) / student.isf(0.025, 5.0)
     for apart, named in ((0.99 * limit, ()), (1.01 * limit, ("k_by",))):
         one = replace(diagnosis("network", k_by=(apart, 1e-4)), freedom={"k_by": 5.0})
         assert isolate_window(one, rate).changed == named
 
 
-def test_a_reading_that_takes_another_change_for_its_own_is_withdrawn_and_only_then() -> None:
+def test_a_reading_confused_by_another_change_is_withdrawn_and_only_then() -> None:
     second = replace(diagnosis("relation", e=(0.2, 0.01), k_by=(0.0, 0.01)), taken_for={"e": {"EI": -2.0}})
     changed = diagnosis("likelihood", e=(0.0, 0.01), k_by=(0.0, 0.01), EI=(-0.1, 0.002))
     told = {one.name: one for one in beside(changed, second).parameters}
@@ -235,7 +235,7 @@ def test_a_reading_that_takes_another_change_for_its_own_is_withdrawn_and_only_t
 
 
 @pytest.mark.parametrize("change", [np.nan, np.inf, -np.inf])
-def test_a_number_that_is_none_is_no_reading(change: float) -> None:
+def test_a_non_finite_number_is_no_reading(change: float) -> None:
     reading = possible_reading("k_by", "relation", change, 0.1)
     assert (reading.relative_change, reading.standard_error, reading.interval_95) == (None, None, None)
     assert reading.reason
@@ -250,13 +250,13 @@ def test_a_reading_without_an_error_has_no_interval() -> None:
     assert (sharp.interval_95, sharp.z) == ((0.1, 0.1), None)
 
 
-def test_ninety_five_per_cent_of_a_normal_distribution_lie_within() -> None:
+def test_z95_is_the_97_5_per_cent_quantile_of_the_normal_distribution() -> None:
     assert pytest.approx(norm.ppf(0.975), abs=1e-6) == Z95
 
 
 @pytest.mark.parametrize(("c_by", "rivals"), [(0.0, True), (-0.14, False)])
-def test_a_parameter_explains_what_a_gain_does_where_its_damping_or_1x_says_so(c_by: float, *, rivals: bool) -> None:
-    """A gain of a place changes stiffness and damping by one factor."""
+def test_parameters_rival_a_wrong_gain_where_damping_or_1x_allows_it(c_by: float, *, rivals: bool) -> None:
+    """A wrong gain at a place changes stiffness and damping by the same factor."""
     readings = (parameter_reading("k_by", "baseline", -0.14, 0.004), parameter_reading("c_by", "baseline", c_by, 0.07))
     evaluation = Evaluation(Diagnosis("baseline", readings, covariance=np.diag([0.004, 0.07]) ** 2), {}, (), (), None)
     gain = Foreign("gain of y1: 1.16 times", hides=True, direction="y")

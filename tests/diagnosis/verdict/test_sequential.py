@@ -1,4 +1,4 @@
-"""The sequential test on Gaussian hops: declared rate, delays, location, repair, thresholds, what it can find."""
+"""The sequential test on Gaussian hops: declared rate, delays, location, repair, thresholds, detectable changes."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ from tests.diagnosis.verdict.test_isolation import covariance, window
 SEED = 88_300
 SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
 ERRORS = np.array([0.0036, 0.0135, 0.0036, 0.0135, 0.018, 0.002])
-"""Of the rotor kit in 60 s, at the limit of what any method can read."""
+"""Standard errors of the rotor kit in 60 s, at the lower bound of any method."""
 COVARIANCE = np.diag(ERRORS**2)
 
 
@@ -49,7 +49,7 @@ def fixed_length_s(name: str, change: float) -> float:
 
 @pytest.mark.slow
 def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
-    """A commissioning that was one of its standard errors off: 32 windows must not make a finding of it."""
+    """A commissioning off by one standard error must not become a finding after 32 windows."""
     shared = np.zeros((6, 6))
     shared[0, 0] = 0.02**2
     offset = true(k_by=0.02)
@@ -75,11 +75,11 @@ def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) ->
     last, count = -1000, 0
     for number, verdict in verdicts:
         if verdict.detected:
-            # What one stretch of noise does to stretches of several lengths is one alarm.
+            # Noise that crosses the threshold at several lengths counts as one alarm.
             count += number - last > 24
             last = number
     expected = declared * n_hops * SETTINGS.hop_s / MONTH_S
-    # Lengths overlap, so what they see is partly the same: the declared rate is an upper bound.
+    # Lengths overlap, so that their results are correlated: the declared rate is an upper bound.
     assert 0.4 * expected < count < expected + 3 * expected**0.5
 
 
@@ -92,7 +92,7 @@ def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) ->
         *(pytest.param(*one, None, marks=pytest.mark.long) for one in (("k_by", -0.05), ("c_by", -0.2), ("e", 0.2))),
     ],
 )
-def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: float, within_s: float | None) -> None:
+def test_delays_are_within_twice_those_of_a_fixed_length_test(name: str, change: float, within_s: float | None) -> None:
     """95 of 100 changes are found, and named, within twice the data of a test made for exactly this change."""
     study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=20, seed=SEED, before_hops=14, after_hops=24)
     allowed_s = within_s or 2 * fixed_length_s(name, change)
@@ -113,7 +113,7 @@ def test_a_small_change_accumulates_over_windows() -> None:
 
 
 def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[int, Stretch]:
-    """The same, but stretches that straddle the change some hops ago read another parameter wrong."""
+    """The looks, but stretches that straddle the change `since` hops ago misread another parameter."""
     return looks | {
         hops: replace(look, vector=look.vector + look.information @ (bias * 4 * (since / hops) * (1 - since / hops)))
         for hops, look in looks.items()
@@ -122,7 +122,7 @@ def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[
 
 
 @pytest.mark.slow
-def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
+def test_a_bias_of_windows_across_a_change_is_not_named() -> None:
     """k_by drops by 25 %; stretches across the change read c_by up to 7 % too large, five standard errors."""
     for seed in range(3):
         test, hops = SequentialTest(SETTINGS), gaussian(SEED + 100 + seed)
@@ -147,8 +147,8 @@ def test_two_changes_at_once_and_one_after_the_other() -> None:
     assert abs(c_bz.since_ns / 5e9 - 50) <= 4
 
 
-def test_what_had_changed_before_the_data_is_dated_to_their_beginning() -> None:
-    """It was said to have come in the newest hops of the first window, ten seconds ago."""
+def test_a_change_before_the_first_data_is_dated_to_their_start() -> None:
+    """It used to be dated to the newest hops of the first window, ten seconds ago."""
     for change in ({"k_by": -0.25}, {"c_bz": -0.3}, {"e": 1.0}):
         test, hops = SequentialTest(SETTINGS), gaussian(SEED + 61)
         verdicts = play(test, hops, (16, true(**change)))
@@ -166,7 +166,7 @@ def test_a_repair_is_noticed_within_seconds() -> None:
     assert abs(k_by.relative_change or 1.0) < 0.04
 
 
-def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> None:
+def test_readings_reach_the_new_value_while_the_window_spans_the_change() -> None:
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 6), (20, true()), (6, true(k_by=-0.25)))
     last = verdicts[-1][1]
     (k_by,) = (reading for reading in last.current if reading.name == "k_by")
@@ -174,8 +174,8 @@ def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> N
     assert not last.settled
 
 
-def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
-    """Windows alone, as without parameters: size and date of what is quoted first hold the truth."""
+def test_intervals_of_a_window_across_a_change_hold_the_truth() -> None:
+    """With whole windows alone, as without parameters, the first quoted size and date hold the truth."""
     settings, rng = SequentialSettings(hop_s=5.0, window_hops=12, short_hops=()), np.random.default_rng(SEED + 21)
     sizes, dates = [], []
     for trial in range(40):
@@ -200,8 +200,8 @@ def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
 
 
 @pytest.mark.parametrize("error", [0.002, 0.0002])
-def test_a_change_that_is_seen_sharply_is_not_taken_for_another_one_at_another_moment(error: float) -> None:
-    """It came within a hop, at any moment: one to eight hops later its size is read within its errors."""
+def test_a_precisely_read_change_within_a_hop_keeps_its_size(error: float) -> None:
+    """It comes at any moment within a hop; one to eight hops later its size is read within its errors."""
     inside = []
     for trial in range(8):
         rng = np.random.default_rng(SEED + 500 + trial)
@@ -215,7 +215,7 @@ def test_a_change_that_is_seen_sharply_is_not_taken_for_another_one_at_another_m
 
 
 @pytest.mark.parametrize("gap", [10, 25])
-def test_a_gap_changes_nothing_but_the_date_of_what_came_after_it(gap: int) -> None:
+def test_a_gap_shifts_only_the_dates_of_later_changes(gap: int) -> None:
     """Older windows span the gap, the latest one does not."""
     hops, told = gaussian(SEED + 24), []
     looks = [hops.looks(true(k_by=-0.2 * (number >= 17))) for number in range(27)]
@@ -235,8 +235,8 @@ def test_a_gap_changes_nothing_but_the_date_of_what_came_after_it(gap: int) -> N
     assert since[1] < 85 < since[2]
 
 
-def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
-    """Of two parameters that hang together one changed much and the other by too little: the first still reads true."""
+def test_a_change_too_small_to_be_named_is_not_fixed_at_zero() -> None:
+    """Of two correlated parameters, one changed much and the other too little: the first still reads true."""
     rng, cov = np.random.default_rng(SEED + 23), np.diag(np.full(6, 1e-4))
     cov[0, 1] = cov[1, 0] = 0.8e-4
     held = nominal = alone = 0
@@ -251,10 +251,10 @@ def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
         low, high = restricted.interval_95 or (0.0, 0.0)
         nominal += low <= -0.3 <= high
     assert alone > 75
-    assert held >= 70 > 20 > nominal  # how sure one is that the other changed differs from window to window
+    assert held >= 70 > 20 > nominal  # the probability that the other changed differs between windows
 
 
-def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
+def test_a_large_misfit_is_outside_the_model() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 7)
     for misfit, outside in [(1.0, False), (8.0, True)]:
         for _ in range(20):
@@ -263,7 +263,7 @@ def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
                 assert test.update(looks).outside_model == outside
 
 
-def test_what_one_parameter_explains_as_well_is_not_outside_the_model() -> None:
+def test_a_foreign_cause_that_one_parameter_rivals_is_not_outside_the_model() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
     for _ in range(20):
         looks = hops.looks(true(k_bz=-0.15))
@@ -276,7 +276,7 @@ def test_what_one_parameter_explains_as_well_is_not_outside_the_model() -> None:
         assert ("a wrong gain, which explains the data as well" in verdict.text) != outside
 
 
-def test_how_long_a_window_that_is_outside_may_be_astride_a_change_is_known() -> None:
+def test_the_time_for_which_a_misfit_may_come_from_a_change_counts_down() -> None:
     alone = SequentialTest(replace(SETTINGS, short_hops=()))
     hops, left_s = gaussian(SEED + 48), []
     for number in range(28):
@@ -288,8 +288,8 @@ def test_how_long_a_window_that_is_outside_may_be_astride_a_change_is_known() ->
 
 
 @pytest.mark.parametrize(("before", "lasting"), [(13, True), (4, False)])
-def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_alone(before: int, lasting: bool) -> None:
-    """Not by stretches too short to show it; but what is outside while a window is astride a change may be that."""
+def test_a_lasting_outside_verdict_is_withdrawn_only_by_a_whole_window(before: int, lasting: bool) -> None:
+    """Shorter stretches do not show the misfit; but while a window spans a change, the misfit may come from it."""
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 47)
     said: list[bool] = []
     for count, values, misfit in ((15, true(), 0.0), (before, true(), 8.0), (11, true(k_by=0.4), 8.0)):
@@ -309,15 +309,15 @@ def test_what_has_long_been_outside_the_model_is_taken_back_by_a_whole_window_al
 
 
 def information(error: float, correlation: float) -> FloatArray:
-    """Of a window in which the unbalance has this error, correlated with that of damping."""
+    """That of a window in which the unbalance has this error, correlated with that of damping."""
     found = np.diag(np.array([0.03, 0.07, 0.03, 0.07, error, 0.01]) ** 2)
     c, e = PARAMETERS.index("c_by"), PARAMETERS.index("e")
     found[c, e] = found[e, c] = correlation * 0.07 * error
     return np.asarray(np.linalg.inv(found), dtype=np.float64)
 
 
-def test_a_window_is_believed_where_a_sum_with_the_one_before_names_another_parameter() -> None:
-    """A change that grows little by little: windows of before and after it are added up."""
+def test_a_window_prevails_over_a_sum_that_names_another_parameter() -> None:
+    """The change is gradual: windows from before and after it are summed."""
     window_ns = 60_000_000_000
     test = SequentialTest(replace(SETTINGS, short_hops=()))
     healthy, now, grown = information(0.03, -0.6), information(0.06, 0.75), true(e=0.35)
@@ -327,7 +327,7 @@ def test_a_window_is_believed_where_a_sum_with_the_one_before_names_another_para
     assert [one.name for one in verdict.changed] == ["e"]
 
 
-def test_a_gap_is_no_part_of_a_sum() -> None:
+def test_sums_do_not_span_a_gap() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
     play(test, hops, (24, true()))
     assert len(test.state.sums[2]) == 1
@@ -338,7 +338,7 @@ def test_a_gap_is_no_part_of_a_sum() -> None:
     }
     test.update(moved)
     assert len(test.state.sums[1]) == 1
-    assert len(test.state.sums[2]) == 1  # nothing was added to what was there before
+    assert len(test.state.sums[2]) == 1  # the earlier sum is unchanged
     assert test.state.sums[2][0].end_ns < shift_ns
     test.clear()
     assert test.state == SequentialState()
@@ -364,7 +364,7 @@ def moving_averages(hops: int, overlap: int, seed: int) -> np.ndarray[tuple[int]
 
 @pytest.mark.parametrize("overlap", [2, 12, 192, *(pytest.param(n, marks=pytest.mark.long) for n in (4, 48))])
 @pytest.mark.parametrize("threshold", [3.0, 3.6])
-def test_new_crossings_of_a_sliding_window(overlap: int, threshold: float) -> None:
+def test_new_crossings_of_a_sliding_window_have_the_expected_rate(overlap: int, threshold: float) -> None:
     """Four million hops; an exceedance is new if none came in the window's length before it."""
     hops = 4_000_000
     above = np.flatnonzero(np.abs(moving_averages(hops, overlap, SEED_OF_CALIBRATION + overlap)) > threshold)
@@ -390,12 +390,12 @@ def test_month_thresholds_have_the_declared_rate(overlap: int) -> None:
     assert found.further > found.first > 3.5
 
 
-def test_rates_and_changes_that_make_no_sense_are_refused() -> None:
+def test_invalid_rates_and_changes_are_refused() -> None:
     with pytest.raises(ValueError, match="rate is 0 for 6 parameters"):
         window_thresholds(0, 6)
     with pytest.raises(ValueError, match="expected positive numbers"):
         month_thresholds(-1, 5.0, 12, 6)
-    assert month_thresholds(1e9, 5.0, 12, 6).first == 1.0  # more often than that nothing is crossed
+    assert month_thresholds(1e9, 5.0, 12, 6).first == 1.0  # crossings cannot be more frequent
     found = detectable_changes(healthy(3), window_thresholds(0.01, 6), 60.0)[0]
     for change in (0.0, -1.0, -2.0):
         with pytest.raises(ValueError, match="expected above -1 and not 0"):
@@ -411,7 +411,7 @@ def healthy(seed: int) -> Stretch:
 
 
 def power(cov: FloatArray, name: str, seed: int) -> list[float]:
-    """Share of windows in which the minimum detectable loss and gain are named: 256, spread as evenly as can be."""
+    """Share of windows in which the minimum detectable loss and gain are named, out of 256 quasi-random ones."""
     thresholds, shares, scatter = window_thresholds(0.01, 6), [], MultivariateNormalQMC(np.zeros(6), cov, rng=seed)
     stretch = stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
     (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
@@ -426,14 +426,14 @@ def power(cov: FloatArray, name: str, seed: int) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["c_by", "e"])
-def test_the_change_is_found_in_95_of_100_windows_and_of_correlated_parameters_never_less(name: str) -> None:
+def test_the_detectable_change_is_found_in_95_per_cent_of_windows(name: str) -> None:
     cov = np.diag(np.geomspace(0.001, 0.02, 6) ** 2)
     assert power(cov, name, SEED_OF_DETECTABLE) == pytest.approx([0.95, 0.95], abs=0.025)
     seed = SEED_OF_DETECTABLE + (name == "e")
     assert min(power(covariance(np.random.default_rng(seed)), "k_bz", seed)) > 0.925
 
 
-def test_loss_and_gain_are_ratios_of_each_other() -> None:
+def test_detectable_loss_and_gain_are_reciprocal_or_symmetric_for_e() -> None:
     for found in detectable_changes(healthy(1), month_thresholds(1.0, 5.0, 12, 6), 60.0):
         if found.name == "e":
             assert found.loss == -found.gain or found.loss == -1
@@ -442,7 +442,7 @@ def test_loss_and_gain_are_ratios_of_each_other() -> None:
         assert -1 <= found.loss < 0 < found.gain
 
 
-def test_length_and_change_are_inverse() -> None:
+def test_the_length_to_find_a_change_inverts_the_detectable_change() -> None:
     stretch, thresholds = healthy(2), window_thresholds(1e-3, 6)
     found = {one.name: one for one in detectable_changes(stretch, thresholds, 60.0)}
     for one in found.values():

@@ -1,4 +1,4 @@
-"""What a monitor remembers, stored as bytes at any block and restored: everything goes on to the last bit."""
+"""The state of a monitor, stored as bytes at any block and restored: everything continues bit for bit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -53,7 +53,7 @@ def monitor(machine: str) -> MachineMonitor:
 
 @lru_cache
 def uninterrupted(machine: str) -> tuple[MonitorReport, ...]:
-    """Reports; and what a hop would have stored was little."""
+    """Reports of an uninterrupted run, after asserting that each hop stores little."""
     running, found, kept = monitor(machine), list[MonitorReport](), tuple[str, ...]()
     for block in stream(machine):
         found.append(running.step(block))
@@ -71,7 +71,7 @@ def renewed(
     build: Callable[[], MachineMonitor],
     heard: Sequence[tuple[bytes, bytes, str]],
 ) -> MachineMonitor:
-    """Another monitor that knows nothing but bytes, and hears again what the first one has heard, if anything."""
+    """Another monitor, restored from bytes alone, that recalls the messages heard so far, if any."""
     state = running.state(tuple(kept), whole=not heard)
     kept |= dict(state.new_parts)
     again = build()
@@ -93,8 +93,8 @@ def renewed(
         pytest.param("no phase reference", True, marks=pytest.mark.long),
     ],
 )
-def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str, recorded: bool) -> None:
-    """Statistics, readings, verdicts and alarms; stopped in warming, at hops, between them, around gap and fault."""
+def test_a_monitor_stopped_at_any_block_continues_bit_for_bit(machine: str, recorded: bool) -> None:
+    """Statistics, readings, verdicts and alarms; stopped in warm-up, at and between hops, around gap and fault."""
     blocks, expected = stream(machine), uninterrupted(machine)
     rng = np.random.default_rng(11)
     hops = [number for number, report in enumerate(expected) if report.windows]
@@ -126,7 +126,7 @@ def windows() -> tuple[WindowStatistics, ...]:
 
 
 @pytest.mark.slow
-def test_a_maximum_followed_for_long_goes_on_to_the_last_bit() -> None:
+def test_a_maximum_followed_over_many_windows_continues_bit_for_bit() -> None:
     """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
     fit = LikelihoodFit(LAB, follow=True)
     expected = [fit.diagnose(window) for window in windows()]
@@ -143,8 +143,8 @@ def test_a_maximum_followed_for_long_goes_on_to_the_last_bit() -> None:
         running = again
 
 
-def test_slopes_taken_over_from_another_speed_are_those_of_that_speed() -> None:
-    """A search that stays where it began keeps the slopes of the search before it, at that one's speed."""
+def test_slopes_kept_from_an_earlier_search_are_restored_at_its_speed() -> None:
+    """A search that does not move keeps the slopes of the previous search, at that search's speed."""
     first, second = windows()[:2]
     fit = LikelihoodFit(LAB, follow=True)
     fit.diagnose(first)
@@ -170,7 +170,7 @@ def remembered() -> dict[str, np.ndarray]:
     }
 
 
-def test_samples_are_known_again_in_either_precision() -> None:
+def test_the_digest_of_samples_does_not_depend_on_their_precision() -> None:
     single = np.random.default_rng(7).standard_normal((50, 3)).astype(np.float32)
     double = single.astype(np.float64)
     assert digest_of(single) == digest_of(double) != digest_of(double * (1 + 1e-12))
@@ -217,7 +217,7 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing() -> None:
         )
 
 
-def test_a_gate_in_the_middle_of_a_stepped_clock_goes_on() -> None:
+def test_a_gate_restored_during_a_clock_step_continues_identically() -> None:
     blocks = scenario_blocks(6.0)
     stepped = [replace(one, start_ns=one.start_ns - 10**12) for one in blocks[20:]]
     wild = replace(blocks[7], start_ns=blocks[7].start_ns + 10**12)
@@ -282,7 +282,7 @@ def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialS
 
 
 def shown(state: SequentialState) -> str:
-    """All of it, every number in all its digits."""
+    """The complete state with every number in full precision."""
     with np.printoptions(floatmode="unique", threshold=1000):
         return repr(replace(state, sums=dict(sorted(state.sums.items()))))
 
@@ -302,7 +302,7 @@ named = st.dictionaries(st.text("abcdefghij_/.file", min_size=1, max_size=12), o
 
 @settings(max_examples=30)
 @given(named)
-def test_arrays_come_back_as_they_were(arrays: dict[str, np.ndarray]) -> None:
+def test_arrays_round_trip_through_bytes(arrays: dict[str, np.ndarray]) -> None:
     data = to_bytes(arrays)
     again = from_bytes(data)
     assert list(again) == list(arrays)
@@ -311,7 +311,7 @@ def test_arrays_come_back_as_they_were(arrays: dict[str, np.ndarray]) -> None:
     assert data == to_bytes(again)
 
 
-def test_how_an_array_lies_in_memory_is_kept_and_objects_are_refused() -> None:
+def test_memory_order_is_kept_and_object_arrays_are_refused() -> None:
     across = np.asfortranarray(np.arange(12.0).reshape(3, 4))
     again = from_bytes(to_bytes({"across": across}))["across"]
     assert again.flags.f_contiguous
@@ -346,7 +346,7 @@ def test_foreign_bytes_are_refused(foreign: bytes, says: str) -> None:
         from_bytes(foreign)
 
 
-def test_parts_are_kept_apart() -> None:
+def test_prefixes_separate_the_parts_of_a_state() -> None:
     parts = prefixed("a", {"x": np.array(1)}) | prefixed("ab", {"x": np.array(2)})
     assert unprefixed("a", parts) == {"x": np.array(1)}
     assert unprefixed("b", parts) == {}
@@ -355,7 +355,7 @@ def test_parts_are_kept_apart() -> None:
 
 
 @pytest.mark.slow
-def test_a_window_is_recalled_though_a_new_block_overtakes_the_newest_known_one() -> None:
+def test_a_window_is_recalled_although_a_block_arrives_out_of_order() -> None:
     blocks, expected = stream("phase reference"), uninterrupted("phase reference")
     before = monitor("phase reference")
     for block in blocks[:680]:

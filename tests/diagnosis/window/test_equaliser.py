@@ -1,4 +1,4 @@
-"""A window of AC-coupled sensors, or of channels sampled one after the other, is that of the vibration itself."""
+"""Windows of AC-coupled sensors, or of channels sampled one after the other, are corrected to the vibration itself."""
 
 from functools import cache
 from typing import Any
@@ -47,7 +47,7 @@ def simulated(*, declared: bool = False, speed_rpm: float | None = None) -> Floa
 
 
 def behind_sensors(samples: FloatArray) -> FloatArray:
-    """Filtered by the responses themselves, as one piece that goes round and round."""
+    """The samples filtered by the declared responses, circularly as one piece."""
     rate_hz, seen = machine(declared=False).rate_hz, samples.copy()
     f = np.fft.rfftfreq(len(samples), 1 / rate_hz)
     for column, sensor in enumerate(machine(declared=True).sensors):
@@ -75,16 +75,16 @@ def apart(found: WindowStatistics, true: WindowStatistics) -> tuple[float, float
 
 
 @pytest.mark.parametrize(("without_angle", "speed_rpm"), [(False, None), (False, 1000.0), (True, None)])
-def test_a_window_is_that_of_the_vibration(without_angle: bool, speed_rpm: float | None) -> None:
+def test_declared_responses_are_corrected_in_a_window(without_angle: bool, speed_rpm: float | None) -> None:
     true_machine, declared = (machine(declared=one, without_angle=without_angle) for one in (False, True))
     true = statistics(true_machine, simulated(speed_rpm=speed_rpm))
     seen = behind_sensors(simulated(speed_rpm=speed_rpm))
     assert all(one < 0.06 for one in apart(statistics(declared, seen), true))
-    # What is not declared is far away.
+    # Responses that are not declared cause large errors.
     assert all(one > 0.1 for one in apart(statistics(true_machine, seen), true))
 
 
-def test_the_latest_hops_say_behind_declared_sensors_what_they_say() -> None:
+def test_the_latest_hops_have_the_same_news_behind_declared_responses() -> None:
     scenario, _ = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=64.0, seed=31_302)
     samples = np.concatenate([block.samples for block, _ in blocks(scenario, machine(declared=False), 1.0)])
@@ -92,17 +92,17 @@ def test_the_latest_hops_say_behind_declared_sensors_what_they_say() -> None:
         sliding, fits = fed(plan_for(of), seen), LengthFits(of)
         window = sure(sliding.statistics())
         fits.window(window)
-        # By chance four hops may say something; what the sensors do not show as it is would, in all of them.
+        # Four hops happen to have news here; a response that is not corrected would cause news in all of them.
         assert [fits.has_news(sliding, window, (hops,)) for hops in (2, 4, 6)] == [False, True, False]
 
 
-def test_simulated_sensors_are_those_of_the_file() -> None:
+def test_the_simulator_applies_the_declared_responses() -> None:
     declared = machine(declared=True)
     found = statistics(declared, simulated(declared=True))
     assert all(one < 0.01 for one in apart(found, statistics(machine(declared=False), simulated())))
 
 
-def test_sensors_whose_signal_is_declared_do_not_contradict_each_other() -> None:
+def test_declared_responses_prevent_findings_of_disagreeing_sensors() -> None:
     undeclared, declared = (machine(declared=one) for one in (False, True))
     seen = behind_sensors(simulated())
     assert sensor_findings(statistics(declared, seen), None, declared.sensors) == ()
@@ -110,7 +110,7 @@ def test_sensors_whose_signal_is_declared_do_not_contradict_each_other() -> None
     assert any("state corner and order of its data sheet as high_pass_hz" in one.text for one in findings)
 
 
-def test_the_stream_and_what_identifies_a_machine_are_the_same_without() -> None:
+def test_declared_responses_leave_descriptor_and_other_machine_files_as_they_are() -> None:
     undeclared, declared = (machine(declared=one) for one in (False, True))
     assert declared.descriptor == undeclared.descriptor
     assert not {"high_pass", "delay_us"} & set(undeclared.model_dump_json().split('"'))
@@ -135,14 +135,14 @@ def test_the_stream_and_what_identifies_a_machine_are_the_same_without() -> None
         ),
     ],
 )
-def test_what_is_no_signal_of_a_sensor_is_refused(name: str, signal: dict[str, Any], says: str) -> None:
+def test_invalid_sensor_responses_are_refused(name: str, signal: dict[str, Any], says: str) -> None:
     fields = load_machine("lab").model_dump()
     fields["sensors"] = [one | (signal if one["name"] == name else {}) for one in fields["sensors"]]
     with pytest.raises(ValidationError, match=says):
         MachineFile.model_validate(fields)
 
 
-def test_a_line_of_hum_is_taken_out_as_the_sensors_show_it() -> None:
+def test_hum_is_removed_behind_declared_responses_too() -> None:
     true_machine, declared = (machine(declared=one) for one in (False, True))
     hummed = simulated().copy()
     t_s = np.arange(len(hummed)) / true_machine.rate_hz

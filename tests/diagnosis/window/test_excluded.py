@@ -1,4 +1,4 @@
-"""Which lines of a window are left out, as they say nothing of the machine; and what is a change of the load."""
+"""Lines that are left out of a window because they say nothing about the machine, and changes of its load."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ STEP: FloatArray = np.repeat([1.0, 9.0], (18, 6))
 
 
 def segments(level: FloatArray, *, sources: int = 4) -> ComplexArray:
-    """Of four motions that some sources make, with a little noise of each; coloured from bin to bin."""
+    """Segments of four motions under some sources, with a little independent noise; coloured over the bins."""
     rng = np.random.default_rng(5100)
 
     def white(channels: int) -> ComplexArray:
@@ -32,7 +32,7 @@ FREQUENCIES_HZ: FloatArray = np.linspace(3, 150, BINS)
 
 
 def with_line(hz: float, size: float = 0.3, wander_hz: float = 0.0) -> ComplexArray:
-    """One source, and in each channel a line of its own phase, of 30 times the noise that channels do not share."""
+    """One source, and in each channel a line of its own phase, of 30 times the independent noise."""
     found = segments(np.ones(SEGMENTS), sources=1)
     at_s = EVERY_S * np.arange(SEGMENTS)
     turns = hz * at_s + wander_hz * 47 / (2 * np.pi) * np.sin(2 * np.pi * at_s / 47)
@@ -58,7 +58,7 @@ def test_mains_hum_is_found_though_no_channel_alone_shows_it(hz: float) -> None:
 
 @pytest.mark.parametrize("hz", [50.04, 100.1, 149.97])
 def test_hum_is_measured_between_the_bins_and_at_the_end_of_the_band(hz: float) -> None:
-    # Of segments that begin at their first sample, neighbouring bins of a line have opposite signs.
+    # If the phase refers to the start of a segment, neighbouring bins of a line have opposite signs.
     found = with_line(hz, 2.0, wander_hz=0.005) * (-1.0) ** np.arange(BINS)[:, None, None]
     (line,) = excluded_lines(found, summed(found), FREQUENCIES_HZ, (2 * np.pi * 22.0,) * 2, None)
     assert line.power is not None
@@ -74,7 +74,7 @@ def test_other_lines_are_left_out_where_the_healthy_machine_had_them() -> None:
     assert not lines_of(found)
     assert not lines_of(found, known=[(41.0, 41 / 22)])
     assert lines_of(found, known=None) == lines_of(found, known=[(37.2, 37.2 / 22)])
-    assert lines_of(found, 20.0, [(41.0, 37.2 / 20)])  # it follows the speed, of a gear
+    assert lines_of(found, 20.0, [(41.0, 37.2 / 20)])  # as of a gear, it follows the speed
 
 
 def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
@@ -87,21 +87,21 @@ def test_a_multiple_of_the_speed_is_no_hum_but_may_be_known() -> None:
 
 
 @pytest.mark.parametrize("order", [1.5, 2.0, 4.0])
-def test_hum_in_one_lobe_with_a_multiple_of_the_speed_is_told_from_it(order: float) -> None:
+def test_hum_is_distinguished_from_a_multiple_of_the_speed_in_the_same_lobe(order: float) -> None:
     """A motor of four poles at full load runs at 1480 rpm, and twice its speed is 0.7 Hz beside the mains."""
     for multiple_hz in (99.7, 100.25):
         assert lines_of(with_line(100.0), multiple_hz / order) == [100.0]
         assert not lines_of(with_line(multiple_hz), multiple_hz / order)
 
 
-def test_what_shakes_the_machine_at_the_mains_is_no_more_hum() -> None:
-    """A stator at fault, a neighbour at 3000 rpm: where the healthy machine had none, it is told as any other line."""
+def test_a_strong_line_at_the_mains_frequency_is_no_hum() -> None:
+    """A stator fault, a neighbour at 3000 rpm: if the healthy machine had none, it is treated as any other line."""
     for size, hum in ((0.2, [50.0]), (1.5, [50.0]), (3.0, []), (30.0, [])):
         assert lines_of(with_line(50.0, size)) == hum
         assert lines_of(with_line(50.0, size), known=[(49.7, 2.26)]) == [50.0]
 
 
-def test_hum_is_hum_where_it_is_most_of_what_one_channel_shows() -> None:
+def test_hum_is_found_even_if_it_dominates_one_channel() -> None:
     found = with_line(50.0)
     found[:, :, 3] -= segments(np.ones(SEGMENTS), sources=1)[:, :, 3] * 0.99
     alone = np.abs(found[:, :, 3]) ** 2
@@ -110,13 +110,13 @@ def test_hum_is_hum_where_it_is_most_of_what_one_channel_shows() -> None:
 
 
 @pytest.mark.parametrize("order", [0.5, 1.5, 2.5])
-def test_half_a_multiple_of_the_speed_is_that_of_a_rub(order: float) -> None:
+def test_a_line_at_a_half_order_of_the_speed_is_no_hum(order: float) -> None:
     found = with_line(50.0)
     assert not lines_of(found, 50 / order)
     assert lines_of(found, 50 / order + 2) == [50.0]
 
 
-def test_the_louder_a_line_the_further_it_reaches() -> None:
+def test_louder_lines_reach_further() -> None:
     faint, loud, known = with_line(50.1, 0.3), with_line(50.1, 30.0), [(50.0, 2.27)]
     (near,) = excluded_lines(faint, summed(faint), FREQUENCIES_HZ, (138.0, 138.0), known)
     (far,) = excluded_lines(loud, summed(loud), FREQUENCIES_HZ, (138.0, 138.0), known)
@@ -134,7 +134,7 @@ def test_noise_and_a_narrow_resonance_are_no_lines() -> None:
     assert not lines_of(found)
 
 
-def test_a_multiple_of_a_speed_that_wanders_is_told_by_going_with_the_shaft() -> None:
+def test_an_order_of_a_wandering_speed_is_recognised_by_following_the_shaft() -> None:
     at_s = EVERY_S * np.arange(SEGMENTS)
     speed_hz, slowest, fastest = 22 * (1 + 0.005 * np.sin(2 * np.pi * at_s / 20)), 2 * np.pi * 21.89, 2 * np.pi * 22.11
     turned = 2 * np.pi * np.cumsum(speed_hz) * EVERY_S
@@ -156,7 +156,7 @@ def test_a_multiple_of_a_speed_that_wanders_is_told_by_going_with_the_shaft() ->
     assert kept.frequency_hz == pytest.approx(110)
 
 
-def test_what_is_kept_of_a_line_is_near_enough_on_a_slow_machine_too() -> None:
+def test_frequency_and_order_of_a_known_line_are_precise_on_slow_machines() -> None:
     for line_hz, speed_hz in ((0.5349, 1.5), (1.534, 0.75), (119.98, 22.0)):
         kept = ExcludedLine(line_hz, 1.0).known(-2 * np.pi * speed_hz)
         assert kept == pytest.approx((line_hz, line_hz / speed_hz), rel=0.005)
@@ -173,7 +173,7 @@ def test_a_load_that_steps_is_read_from_the_segments() -> None:
 
 
 @pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels", "too large", "steady"])
-def test_what_is_not_the_load(kind: str) -> None:
+def test_changes_that_are_not_of_the_load_give_no_levels(kind: str) -> None:
     found = segments(np.ones(SEGMENTS))
     if kind == "line":
         found[100, 18:] += 1000.0

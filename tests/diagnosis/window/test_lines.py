@@ -38,7 +38,7 @@ def slow(hz: float) -> FloatArray:
 def recording(
     of_y1: FloatArray, turns: int = 1, *, machine: MachineFile = MACHINE, speed_hz: float = SPEED_HZ
 ) -> HealthyRecording:
-    """Of noise in every channel, and more in the first; turning one way or the other, with a strong 1x."""
+    """Noise and a strong 1x in every channel, and `of_y1` added to the first; `turns` is the direction."""
     samples = np.column_stack([noise(n) + line(speed_hz, 3.0) for n in range(len(machine.sensors))])
     samples[:, 0] += of_y1
     samples[:, -1] = np.mod(turns * 2 * np.pi * speed_hz * T, 2 * np.pi)
@@ -81,7 +81,7 @@ def test_a_line_is_found_with_its_share_and_kept_by_frequency_and_order() -> Non
     assert found.known(2 * np.pi * SPEED_HZ) == pytest.approx((30.0, 30.0 / 22.0), abs=0.01)
 
 
-def test_neither_a_multiple_of_the_speed_nor_its_pulsation_nor_a_resonance_nor_a_burst_is_one() -> None:
+def test_orders_pulsations_resonances_and_bursts_are_no_lines() -> None:
     assert lines(line(2 * SPEED_HZ)) == lines(line(2 * SPEED_HZ), turns=-1) == ()
     root = np.exp(2 * np.pi * (-0.003 + 1j) * 40 / RATE_HZ)  # damped by 0.3 %
     resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(20))
@@ -91,7 +91,7 @@ def test_neither_a_multiple_of_the_speed_nor_its_pulsation_nor_a_resonance_nor_a
 
 
 def taken(latest: LatestLines, made: HealthyRecording, after: float) -> tuple[Line, ...]:
-    """Its window, moved to so many windows later."""
+    """Lines taken from the recording's window, moved by `after` windows."""
     window = window_statistics(made.plan, made.hops, lagged=False)
     later_ns = round(after * (window.end_ns - window.start_ns))
     window = replace(window, start_ns=window.start_ns + later_ns, end_ns=window.end_ns + later_ns)
@@ -124,8 +124,8 @@ def test_lines_from_before_a_clock_was_set_back_are_forgotten() -> None:
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.003])
-def test_one_impact_or_burst_in_each_window_is_none(damping: float) -> None:
-    """It is in phase as long as it lasts, and what lasts for a few segments only is no line."""
+def test_one_impact_or_burst_in_each_window_is_no_line(damping: float) -> None:
+    """It is coherent while it lasts, but a line lasts for more than a few segments."""
     machine, latest = with_segments(2.0), LatestLines()
     for number, at_s in enumerate((20.3, 41.7)):
         since = np.clip(T - at_s, 0.0, None)
@@ -142,7 +142,7 @@ def test_one_impact_or_burst_in_each_window_is_none(damping: float) -> None:
         (33.0, 0.1, SPEED_HZ, False), (33.0, 0.5, 1.1 * SPEED_HZ, False),
     ],
 )  # fmt: skip
-def test_new_is_what_stands_out_at_another_frequency_and_order(
+def test_a_new_line_stands_out_at_another_frequency_and_order(
     hz: float, amplitude: float, speed_hz: float, new: bool
 ) -> None:
     assert (new_line(lines(line(hz, amplitude)), healthy(), 2 * np.pi * speed_hz) is not None) is new
@@ -164,8 +164,8 @@ def test_a_line_that_beats_with_a_multiple_of_the_speed_is_found_beside_it(hz: f
 
 
 @pytest.mark.parametrize("off_hz", [-0.85, 0.85])
-def test_what_a_multiple_reaches_is_no_measure_of_a_line_beside_it(off_hz: float) -> None:
-    """In segments of 2 s the two of them fill most of the bins that noise is seen in."""
+def test_bins_that_a_multiple_reaches_are_not_noise_of_a_line_beside_it(off_hz: float) -> None:
+    """In segments of 2 s the two lines fill most of the bins in which noise is measured."""
     speed_hz = 22.2
     made = recording(line(speed_hz + off_hz), machine=with_segments(2.0), speed_hz=speed_hz)
     (found,) = lines_of(made)
@@ -173,7 +173,7 @@ def test_what_a_multiple_reaches_is_no_measure_of_a_line_beside_it(off_hz: float
     assert found.frequency_hz == pytest.approx(speed_hz + off_hz, abs=0.02)
 
 
-def test_a_beat_of_the_healthy_machine_is_not_new_and_a_1x_that_drifted_then_hides_none() -> None:
+def test_a_beat_of_the_healthy_machine_is_not_new_and_a_drifting_1x_hides_none() -> None:
     beats, drifts = line(22.08), line(SPEED_HZ, 6.0) * T / T[-1]
     found, speed_rad_s = lines(beats), 2 * np.pi * SPEED_HZ
     for healthy_y1, new in ((beats, False), (drifts, True)):

@@ -1,4 +1,4 @@
-"""Which hops' lines are those of one shaft."""
+"""The hops whose lines belong to one shaft."""
 
 from dataclasses import replace
 
@@ -18,8 +18,8 @@ def lines(seed: int, wander_hz: float, sweep_hz_s: float, strength: float = 30.0
     return tuple(RotationLine(2 * np.pi * f, 2 * np.pi * s, strength) for f, s in zip(speeds, sweeps, strict=True))
 
 
-def test_a_steady_shaft_is_followed_whatever_its_sweeps_are_taken_for() -> None:
-    """Of a machine that hardly vibrates but at its resonance: lines to 0.01 Hz, sweeps to 0.02 Hz/s."""
+def test_a_steady_shaft_is_followed_despite_errors_of_its_sweeps() -> None:
+    """On a machine that vibrates mostly at its resonance: lines to 0.01 Hz, sweeps to 0.02 Hz/s."""
     for seed in range(50):
         speeds = sure(followed_speeds(lines(seed, 0.01, 0.02), HOP_S))
         assert np.all(np.abs(speeds / (2 * np.pi) - SPEED_HZ) < 0.06)
@@ -32,7 +32,7 @@ def test_a_hop_with_another_peak_is_left_out() -> None:
     assert np.flatnonzero(~np.isfinite(speeds)).tolist() == [4, 9]
 
 
-def test_what_wanders_like_the_peak_of_a_resonance_is_no_shaft() -> None:
+def test_a_line_wandering_like_a_resonance_peak_is_no_shaft() -> None:
     followed = [followed_speeds(lines(seed, 0.15, 0.02), HOP_S) is not None for seed in range(200)]
     assert np.mean(followed) < 0.05
 
@@ -49,7 +49,7 @@ def test_a_drive_is_followed_at_each_set_point(to: float) -> None:
     assert np.flatnonzero(~settled_hops(drive, speeds, HOP_S)).tolist() == [5, 6, 7]
 
 
-def test_a_ramp_that_the_sweeps_tell_of_is_settled_and_one_that_they_do_not_is_not() -> None:
+def test_a_ramp_is_settled_only_if_the_sweeps_confirm_it() -> None:
     rng = np.random.default_rng(SEED)
     hz = SPEED_HZ + 0.25 * np.clip(np.arange(HOPS) - 3.5, 0.0, 6.0)  # from the fifth hop to the tenth
     sweeps = np.repeat([0.0, 0.05, 0.0], [4, 6, 2]) + 0.001 * rng.standard_normal(HOPS)
@@ -63,7 +63,7 @@ def test_a_ramp_that_the_sweeps_tell_of_is_settled_and_one_that_they_do_not_is_n
 
 
 @pytest.mark.parametrize("weak", [range(6, 12), range(11, 12), range(3, 4)])
-def test_lines_that_are_weaker_at_one_speed_are_of_a_load_that_has_grown(weak: range) -> None:
+def test_weaker_lines_at_the_same_speed_leave_all_hops_settled(weak: range) -> None:
     steady = lines(5, 0.01, 0.02, strength=100.0)
     grown = tuple(
         replace(one, strength=30.0 if n == 11 else 15.0) if n in weak else one for n, one in enumerate(steady)
@@ -71,7 +71,7 @@ def test_lines_that_are_weaker_at_one_speed_are_of_a_load_that_has_grown(weak: r
     assert settled_hops(grown, sure(followed_speeds(grown, HOP_S)), HOP_S).all()
 
 
-def test_lines_that_do_not_stand_out_tell_of_no_change() -> None:
+def test_faint_lines_leave_all_hops_settled() -> None:
     weak = lines(4, 0.01, 0.02, strength=8.0)
     speeds = sure(followed_speeds((*weak[:5], None, *weak[6:]), HOP_S))
     assert settled_hops((*weak[:5], None, *weak[6:]), speeds, HOP_S).all()

@@ -87,7 +87,7 @@ def batch_correlation(plan: Plan, samples: FloatArray, end: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("hop", [100, 306, 307, 2000])
-def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
+def test_lagged_products_match_their_definition_for_any_hop(hop: int) -> None:
     """Shorter and longer than a block of the transform, with channels six orders of magnitude apart."""
     plan = replace(small_plan(), hop=hop, stride=hop)
     samples = signal(plan.preamble + hop, 31)
@@ -102,13 +102,13 @@ def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
 
 
 @pytest.mark.parametrize("lags", [[0, 1, 2, 3], [0, 3, 6, 9], [0, 7, 14], [0, 6, 9], [0, 40]])
-def test_products_are_their_definition_at_whatever_lags(lags: list[int]) -> None:
+def test_lagged_products_match_their_definition_at_any_lags(lags: list[int]) -> None:
     a = np.random.default_rng(32).standard_normal((3, 50 + 1000))
     direct = np.stack([a[:, 50 - lag : 1050 - lag] @ a[:, 50:].T for lag in lags])
     np.testing.assert_allclose(lagged_products(a, np.array(lags), 50), direct, atol=1e-9)
 
 
-def test_a_window_is_made_again_when_it_is_looked_at_although_the_stream_has_gone_on() -> None:
+def test_a_past_window_is_recomputed_although_the_stream_has_moved_on() -> None:
     window, samples = SlidingWindow(small_plan()), signal(1200, 33)
     feed(window, samples[:300])
     assert window.again() is None
@@ -139,7 +139,7 @@ def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[i
 
 
 @pytest.mark.slow
-def test_a_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
+def test_sliding_equals_batch_despite_an_offset_a_million_times_the_fluctuation() -> None:
     """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
     longer = replace(small_plan(angle=False), rate_hz=1e4, hop=25_000, stride=25_000, max_span_ns=10**13)
     plan = replace(longer, lags=np.array([0, 5, 20]), bins=np.arange(2, 5))
@@ -184,7 +184,7 @@ def test_a_drift_of_the_mean_is_no_vibration(drift: FloatArray, most: float) -> 
     assert np.abs((drifting.hop_correlation.mean(axis=0) - still.correlation) / power).max() < most
 
 
-def test_a_drift_of_the_rotation_is_no_vibration_either() -> None:
+def test_a_drift_of_the_1x_vector_is_no_vibration() -> None:
     plan, samples = replace(small_plan(hops=20), hop=400, stride=400), signal(8_200, 18)
     (still,) = feed(SlidingWindow(plan), samples)[-1:]
     assert still.with_steady_rotation is still
@@ -249,7 +249,7 @@ def test_plan_of_a_machine_names_its_states_in_the_order_of_the_theory() -> None
     np.testing.assert_allclose(si[:, 8], raw[:, 8])
 
 
-def test_waveform_is_its_definition() -> None:
+def test_the_waveform_matches_its_definition() -> None:
     x = np.array([[0.0, 1, 1, 2, 2, 2, -1, -1, 0, 2], [3.0] * 10, [0.5, 1.5, 0.25, 4, 3, 2, 1, 0, -1, -2]]).T
     seen, _ = waveform_of(x)
     np.testing.assert_allclose(seen.mean, x.mean(axis=0))
@@ -304,8 +304,8 @@ def without_angle(plan: Plan) -> Plan:
 
 
 @pytest.mark.slow
-def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank() -> None:
-    """15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
+def test_readings_stay_unbiased_across_the_flank_of_a_resonance() -> None:
+    """A rise of 15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
     plan = without_angle(plan_for(LAB, lagged=False))
     z, misfit = [], []
     for seed in (40, 41):
@@ -337,7 +337,7 @@ def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
     assert np.median(error) < 0.05
 
 
-def test_without_a_line_there_is_no_speed_and_nothing_is_taken_out() -> None:
+def test_without_a_line_there_is_no_speed_and_nothing_is_removed() -> None:
     samples, plan = run_of_lab(51, unbalanced=False)[:, :-1], without_angle(plan_for(LAB, lagged=False))
     (window,) = feed(SlidingWindow(plan), samples)
     assert window.speed_source == "unknown"
@@ -368,7 +368,7 @@ def test_hop_by_hop_any_splitting_gives_identical_statistics(cuts: list[int], an
         assert_identical(a, b)
 
 
-def test_spectra_go_straight_over_lines_and_never_through_one_beside() -> None:
+def test_spectra_are_interpolated_across_lines_and_not_from_adjacent_ones() -> None:
     window = feed(SlidingWindow(small_plan()), signal(500, 5))[-1]
     spectrum = window.spectrum.copy()
     spectrum[[10, 11, 12, 15, 16, 17]] *= 1e6
