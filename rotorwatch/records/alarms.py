@@ -32,7 +32,7 @@ class EventKind(StrEnum):
 
 
 class AlarmState(StrEnum):
-    """Where an alarm is."""
+    """State of an alarm in its life cycle."""
 
     NORMAL = "normal"
     UNACKNOWLEDGED = "unacknowledged"
@@ -58,26 +58,27 @@ _STATE_TEXT = (
 _AlarmName = Annotated[
     str,
     Field(
-        description="k_by, c_by, k_bz, c_bz, e, EI, model (outside the model), shape (vibration changed), data-... "
-        "(data health, by kind), monitor-... (fault or overload of the monitor) or stream-lost",
+        description="k_by, c_by, k_bz, c_bz, e, EI, changed (not certain what), model (outside the model), shape "
+        "(vibration changed), level:CHANNEL (vibration levels), data-... (data health, by kind), monitor-... (fault "
+        "or overload of the monitor) or stream-lost",
         examples=["k_by"],
     ),
 ]
 
 _AlarmChange = Annotated[
-    Number, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
+    Number, Field(description="deciding relative change; null if not about a parameter", examples=[-0.247])
 ]
 
-_AlarmError = Annotated[Number, Field(description="its standard error", examples=[0.0071])]
+_AlarmError = Annotated[Number, Field(description="standard error of the relative change", examples=[0.0071])]
 
 _AlarmInterval = Annotated[
-    tuple[float, float] | None, Field(description="its 95 % interval", examples=[(-0.261, -0.233)])
+    tuple[float, float] | None, Field(description="95 % interval of the relative change", examples=[(-0.261, -0.233)])
 ]
 
 _LowConfidence = Annotated[
     bool,
     Field(
-        description="another cause is possible, as outside the model: the parameter named here has low confidence",
+        description="named with low confidence: another cause is possible, such as one outside the model",
         examples=[False],
     ),
 ]
@@ -85,7 +86,7 @@ _LowConfidence = Annotated[
 _Note = Annotated[
     str,
     Field(
-        description="what is known of it, in words; of a parameter only where its change has a direction", examples=[""]
+        description="what else is known, in words, such as size and direction of a change of unbalance", examples=[""]
     ),
 ]
 
@@ -97,13 +98,14 @@ class Evidence(Record):
     end_ns: int = Field(description="end of the newest data", examples=[EXAMPLE_NS])
     confidence: Number = Field(
         default=None,
-        description="probability that what is named changed and nothing else; null where none is computed",
+        description="probability that exactly the named parameters changed; null if none is computed",
         examples=[0.996],
     )
 
 
 _Evidence = Annotated[
-    Evidence | None, Field(description="the data that decided; null where it is no window or none has decided")
+    Evidence | None,
+    Field(description="data on which the alarm was decided; null if it was not decided on a window, or not at all yet"),
 ]
 
 
@@ -111,37 +113,37 @@ class Shelf(Record):
     """Why an alarm is shelved, and until when."""
 
     until_ns: int = Field(
-        description="data time at which it ends at the latest", examples=[EXAMPLE_NS + 3_600_000_000_000]
+        description="data time at which shelving ends at the latest", examples=[EXAMPLE_NS + 3_600_000_000_000]
     )
-    one_shot: bool = Field(description="it ends when the condition clears, if that is earlier", examples=[False])
-    by: str = Field(description="who", examples=["anna"])
-    reason: str = Field(description="why", examples=["sensor cable is being replaced"])
+    one_shot: bool = Field(description="shelving ends when the condition clears, if that is earlier", examples=[False])
+    by: str = Field(description="who shelved the alarm", examples=["anna"])
+    reason: str = Field(description="why the alarm was shelved", examples=["sensor cable is being replaced"])
 
 
 class Alarm(Record):
-    """One alarm of a machine: of a parameter, the model, the data, or the stream."""
+    """One alarm of a machine: about a parameter, the model, a channel, the data, the stream or the monitor."""
 
     name: _AlarmName
-    text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
+    text: str = Field(description="what the alarm is about, in words", examples=["bearing stiffness, horizontal"])
     state: AlarmState = Field(description=_STATE_TEXT, examples=["unacknowledged"])
     pending: bool = Field(
-        description="its condition has begun, and must last for the on-delay before it is raised", examples=[False]
+        description="the condition has begun, but must last for the on-delay to raise the alarm", examples=[False]
     )
     clearing: bool = Field(
-        description="its condition has ended, which must last for the off-delay before it clears", examples=[False]
+        description="the condition has ended, but must stay away for the off-delay to clear the alarm", examples=[False]
     )
-    present: bool = Field(description="its condition is present, delays included", examples=[True])
+    present: bool = Field(description="the condition is present, on-delay and off-delay included", examples=[True])
     raised: bool = Field(
-        description="its condition is present and shown to operators: not shelved, suppressed or out of service",
+        description="the condition is present and shown to operators: not shelved, suppressed or out of service",
         examples=[True],
     )
     severity: Severity = Field(
-        description="of the present occurrence while its condition is present; otherwise of the last one",
+        description="severity of the present occurrence, or of the last one if the condition is not present",
         examples=["alert"],
     )
     since_ns: int = Field(description="data time at which `state` was entered", examples=[EXAMPLE_NS])
     raised_ns: int | None = Field(description="data time at which the present occurrence began", examples=[EXAMPLE_NS])
-    occurrence: int = Field(description="how often its condition began, across restarts", examples=[1])
+    occurrence: int = Field(description="how often the condition has begun, across restarts", examples=[1])
     relative_change: _AlarmChange
     standard_error: _AlarmError
     interval_95: _AlarmInterval
@@ -149,18 +151,18 @@ class Alarm(Record):
     note: _Note
     evidence: _Evidence
     shelf: Shelf | None = Field(description="only while shelved", examples=[None])
-    suppressed_by: str = Field(description="rules that suppress it now, in words; empty if none", examples=[""])
+    suppressed_by: str = Field(description="rules that now suppress the alarm, in words; empty if none", examples=[""])
     out_of_service_by: str = Field(description="who took it out of service; empty otherwise", examples=[""])
-    out_of_service_reason: str = Field(description="and why", examples=[""])
+    out_of_service_reason: str = Field(description="why it was taken out of service", examples=[""])
     version: int = Field(
-        description="sequence number of its latest event, -1 before the first; send it back with an operation, "
-        "which is then done only if nothing has happened in between",
+        description="sequence number of the alarm's latest event, -1 before the first; send it with an operation, so "
+        "that this is done only if nothing has happened in between",
         examples=[0],
     )
 
 
 class AlarmStates(OfMachine):
-    """The alarms of one machine that are not normal (or all there have been, if asked for)."""
+    """The alarms of one machine that are not normal; on request, all that have ever occurred."""
 
     alarms: tuple[Alarm, ...] = Field(description="one entry per alarm")
     sequence: int = Field(
@@ -184,14 +186,14 @@ class AlarmEventData(OfMachine):
         examples=["raised"],
     )
     before: AlarmState = Field(description="state of the alarm before the event", examples=["normal"])
-    state: AlarmState = Field(description="state after it", examples=["unacknowledged"])
+    state: AlarmState = Field(description="state of the alarm after the event", examples=["unacknowledged"])
     annunciated: bool = Field(
         description="operators are notified: the alarm is not shelved, suppressed or out of service", examples=[True]
     )
     severity: Severity = Field(description="alert or danger", examples=["alert"])
     time_ns: int = Field(description="data time of the event", examples=[EXAMPLE_NS])
     raised_ns: int | None = Field(description="data time at which this occurrence began", examples=[EXAMPLE_NS])
-    occurrence: int = Field(description="how often the condition of the alarm began, across restarts", examples=[1])
+    occurrence: int = Field(description="how often the condition of the alarm has begun, across restarts", examples=[1])
     sequence: int = Field(
         description="counts the machine's events from 0, without a gap, across restarts", examples=[0]
     )
@@ -201,7 +203,7 @@ class AlarmEventData(OfMachine):
     low_confidence: _LowConfidence
     note: _Note
     evidence: _Evidence
-    actor: str = Field(description="who did it; empty for the monitor itself", examples=[""])
+    actor: str = Field(description="who caused the event; empty for the monitor itself", examples=[""])
     reason: str = Field(description="why, in the words of the actor or the rule", examples=[""])
     bundle: BundleIdentity
     machine_hash: MachineHash
@@ -213,14 +215,14 @@ class AlarmCloudEvent(Record):
 
     specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
     id: str = Field(
-        description="the same however often the event is delivered: machine, sequence, alarm, kind",
+        description="the same in every delivery of the event: machine, sequence, alarm, kind",
         examples=["demo/lab/0/k_by/raised"],
     )
     source: str = Field(description="the machine", examples=["/rotorwatch/demo/lab"])
     type: str = Field(description="org.rotorwatch.alarm.<kind>", examples=["org.rotorwatch.alarm.raised"])
-    subject: str = Field(description="the alarm, by its name", examples=["k_by"])
+    subject: str = Field(description="name of the alarm", examples=["k_by"])
     time: str = Field(description="data time, RFC 3339, microseconds", examples=["2026-01-01T00:03:25.000000Z"])
-    datacontenttype: Literal["application/json"] = Field(description="of `data`", examples=["application/json"])
+    datacontenttype: Literal["application/json"] = Field(description="type of `data`", examples=["application/json"])
     sequence: str = Field(
         description="CloudEvents extension: counts the machine's events without a gap, across restarts; sorts as text",
         examples=["00000000000000000000"],
@@ -231,9 +233,9 @@ class AlarmCloudEvent(Record):
 class AlarmLogPage(OfMachine):
     """Part of a machine's alarm log, from a given sequence number on: the answer to a query on ``alarm/event``."""
 
-    events: tuple[AlarmCloudEvent, ...] = Field(description="events after the one asked for, in order, without a gap")
+    events: tuple[AlarmCloudEvent, ...] = Field(description="events after the given sequence, in order, without a gap")
     latest: int = Field(
-        description="sequence number of the machine's latest event; -1 before the first. Ask again from the last event "
-        "as long as it is smaller",
+        description="sequence number of the machine's latest event; -1 before the first. While the last event "
+        "received has a smaller number, ask again from there",
         examples=[0],
     )

@@ -30,7 +30,7 @@ Name = Annotated[str, Field(description="name of the machine", examples=["lab"])
 
 BundleIdentity = Annotated[
     str | None,
-    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
+    Field(description="identity of the trained or commissioned bundle; null without", examples=["lab-3f9c1e0b7a52"]),
 ]
 
 MachineHash = Annotated[

@@ -51,18 +51,19 @@ class Report(OfMachine):
     start_ns: int = Field(description="oldest data in the window", examples=[EXAMPLE_NS - 60_000_000_000])
     end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
     state: State
-    filled: float = Field(description="fraction of a full window", examples=[1.0])
+    filled: float = Field(description="filled fraction of the window", examples=[1.0])
     speed_rad_s: Annotated[Number, Measure("speed", "rad/s")] = Field(
         default=None, description="mean speed in the window", examples=[138.23]
     )
     misfit_z: Annotated[Number, Measure("misfit", "1")] = Field(
         default=None,
-        description="distance of the window from what the model can explain, standard deviations; null without a test",
+        description="distance of the window from what the model can explain, in standard deviations; null if not "
+        "tested",
         examples=[0.4],
     )
     suspect: str = Field(
         default="",
-        description="what explains data outside the model best, if one thing does; else empty",
+        description="cause that best explains data outside the model; empty if no single cause does",
         examples=[""],
     )
     verdict: Verdict | None = Field(default=None, description="what has changed; null if the window was not evaluated")
@@ -71,33 +72,36 @@ class Report(OfMachine):
     )
     opinions: tuple[Opinion, ...] = Field(default=(), description="what the other diagnosticians read in the window")
     equations: tuple[Equation, ...] = Field(default=(), description="the networks' residuals, equation by equation")
-    detectable: tuple[Detectable, ...] = Field(default=(), description="what would have been found in this window")
+    detectable: tuple[Detectable, ...] = Field(default=(), description="smallest changes this window would have shown")
     sensors: tuple[SensorFault, ...] = Field(
         default=(),
-        description="faults of sensors in the window; nothing is said of the machine unless diagnosed without them",
+        description="sensor faults in the window; the machine is then not diagnosed, unless this is possible without "
+        "the faulty sensors",
         examples=[()],
     )
     shapes: tuple[Shape, ...] = Field(
-        default=(), description="where no equation can be evaluated: whether each channel is as it was", examples=[()]
+        default=(),
+        description="if no equation can be evaluated: whether each channel vibrates as when healthy",
+        examples=[()],
     )
     levels: tuple[ChannelLevels, ...] = Field(default=(), description="vibration levels, channel by channel")
     level_growth: LevelGrowth | None = Field(
         default=None,
-        description="where the state is unchanged or watching: what growth of the levels would have raised an alert",
+        description="in the states unchanged and watching: growth of the levels that would have raised an alert",
         examples=[None],
     )
     skipped: bool = Field(
         default=False,
         exclude_if=lambda value: not value,
-        description="true where the window was not evaluated because the monitor could not keep up, and only its "
-        "levels and sensors were judged; left out otherwise",
+        description="true if only levels and sensors of the window were judged, because the monitor could not keep "
+        "up; left out otherwise",
         examples=[False],
     )
     gyroscopic: Literal["", "opposite"] = Field(
         default="",
         exclude_if=lambda value: not value,
-        description="opposite where the window was compared with theory whose gyroscopic moments have the opposite "
-        "sense to Eq. (27), because they explain the machine and those do not; left out otherwise",
+        description="opposite if the window was compared with theory whose gyroscopic moments have the opposite sense "
+        "to Eq. (27), because that explains the machine and Eq. (27) does not; left out otherwise",
         examples=[""],
     )
     reason: Reason = ""
@@ -117,14 +121,14 @@ MEASURES: Mapping[str, tuple[str, Measure]] = MappingProxyType(
 
 
 class Quality(Record):
-    """What came in since the monitor started."""
+    """Data received since the monitor started."""
 
     accepted_blocks: int = Field(default=0, description="blocks accepted", examples=[2051])
     refused_blocks: dict[str, int] = Field(
         default={}, description="blocks refused, by reason", examples=[{"not-finite": 3}]
     )
-    gaps: int = Field(default=0, description="interruptions before accepted blocks", examples=[1])
-    missing_s: float = Field(default=0.0, description="data time the gaps cost", examples=[0.3])
+    gaps: int = Field(default=0, description="gaps: interruptions before accepted blocks", examples=[1])
+    missing_s: float = Field(default=0.0, description="data time lost in gaps", examples=[0.3])
     queue_dropped_blocks: int = Field(
         default=0, description="blocks dropped because the monitor could not keep up", examples=[0]
     )
@@ -145,7 +149,7 @@ class Quality(Record):
 
 
 class StreamStatus(Record):
-    """What is known about whoever publishes the stream."""
+    """What is known about the publisher of the stream."""
 
     publisher_alive: bool = Field(
         description="a publisher's liveliness token is present; publishers need not have one", examples=[True]
@@ -154,7 +158,7 @@ class StreamStatus(Record):
         description="no usable block for longer than `no_data_after_s` of the machine file", examples=[False]
     )
     silent_since_ns: int | None = Field(
-        description="end of the newest data, while it is silent; null while data come, or if none ever came",
+        description="end of the newest data during silence; null while data arrive, or if none ever did",
         examples=[None],
     )
     data_age_s: float | None = Field(
@@ -169,32 +173,32 @@ class StreamStatus(Record):
 
 
 class Health(OfMachine):
-    """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
+    """Current health of a machine: state, report of the latest window, alarms, quality of the data."""
 
     state: HealthState = Field(
-        description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
-        "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence, and no alarm on the "
-        "machine is raised; see `stream.silent`), not-evaluable or watching (only vibration levels are watched: the "
-        "machine is neither known nor commissioned)",
+        description="warming, healthy, unchanged (no equation can be evaluated, but every channel vibrates as on the "
+        "healthy machine), alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence, and no "
+        "alarm on the machine is raised; see `stream.silent`), not-evaluable or watching (only vibration levels are "
+        "watched, because the parameters are not known and the machine is not commissioned)",
         examples=["alert"],
     )
     reason: str = Field(
-        description="since when there are no data, and why nothing is said of the machine; empty otherwise",
+        description="since when no data have arrived, and why the machine is not diagnosed; empty otherwise",
         examples=[""],
     )
     filled: float = Field(description="fraction of a full window that is filled now", examples=[1.0])
-    report: Report | None = Field(description="the latest window; null before the first hop")
+    report: Report | None = Field(description="report of the latest window; null before the first hop")
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     sequence: int = Field(
-        default=-1, description="sequence number of the latest alarm event in them; -1 before the first", examples=[0]
+        default=-1, description="sequence number of the latest event in `alarms`; -1 before the first", examples=[0]
     )
-    quality: Quality = Field(description="what came in")
+    quality: Quality = Field(description="data received since the monitor started")
     stream: StreamStatus = Field(description="what is known about the publisher")
     restart: str = Field(
-        description="what became of the state from before the latest start of the monitor; empty if there was none",
+        description="what became of the state saved before the latest start of the monitor; empty if none was saved",
         examples=["resumed at 2026-01-01T00:02:55Z"],
     )
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
-    last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+    last_worker_error: str = Field(description="latest error inside the monitor; empty if none", examples=[""])
     bundle: BundleIdentity
     machine_hash: MachineHash

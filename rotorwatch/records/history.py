@@ -31,7 +31,7 @@ class AlarmEventList(Record):
 
 
 class Picture(Record):
-    """A machine at one window: what was said of it, its spectra, orbits and correlation functions."""
+    """A machine at one window: report, spectra, orbits and correlation functions."""
 
     report: Report
     spectra: SpectrumSnapshot
@@ -39,44 +39,44 @@ class Picture(Record):
     correlations: CorrelationSnapshot | None = Field(
         default=None,
         exclude_if=lambda value: value is None,
-        description="of the pairs that are answered with where none is asked for, without predictions; left out of "
-        "what an earlier version kept",
+        description="correlation functions of the default pairs, without predictions; missing from pictures kept by "
+        "an earlier version",
     )
 
 
 class AlarmEvidence(OfMachine):
-    """What one occurrence of an alarm rests on, and what the machine was like before."""
+    """Evidence of one occurrence of an alarm: the machine before, when it was raised, and after the change."""
 
-    name: str = Field(description="of the alarm", examples=["k_by"])
-    occurrence: int = Field(description="which time its condition began", examples=[1])
+    name: str = Field(description="name of the alarm", examples=["k_by"])
+    occurrence: int = Field(description="which occurrence of its condition, counted from 1", examples=[1])
     before: Picture | None = Field(
-        description="the latest that was kept while nothing was wrong, one an hour; null if there is none",
+        description="latest picture kept while nothing was wrong (one per hour is kept); null if there is none",
         examples=[None],
     )
-    raised: Picture = Field(description="the window that it was raised with")
+    raised: Picture = Field(description="picture of the window with which the alarm was raised")
     settled: Picture | None = Field(
-        description="the first window without data from before the change; null if it has not come, or the alarm "
-        "cleared before",
+        description="picture of the first window without data from before the change; null if there is none yet, or "
+        "the alarm cleared before it",
         examples=[None],
     )
 
 
 class Reading(Record):
-    """One number of one window."""
+    """One number read in one window."""
 
     number: int = Field(description="counts the machine's windows in the order of arrival", examples=[4711])
     end_ns: int = Field(description="end of the window", examples=[EXAMPLE_NS])
-    value: float = Field(description="as in the report", examples=[-0.247])
-    standard_error: float | None = Field(description="its standard error; null if there is none", examples=[0.0071])
+    value: float = Field(description="value as in the report", examples=[-0.247])
+    standard_error: float | None = Field(description="standard error; null if there is none", examples=[0.0071])
 
 
 class ReadingBucket(Record):
-    """Readings of one name over a stretch of time."""
+    """Readings of one name in windows that end within a stretch of time."""
 
     name: str = Field(description="which parameter, equation or level", examples=["k_by"])
-    start_ns: int = Field(description="windows that end from here on", examples=[EXAMPLE_NS - 60_000_000_000])
-    length_ns: int = Field(description="for so long", examples=[60_000_000_000])
-    count: int = Field(description="how many readings", examples=[12])
+    start_ns: int = Field(description="beginning of the bucket", examples=[EXAMPLE_NS - 60_000_000_000])
+    length_ns: int = Field(description="length of the bucket", examples=[60_000_000_000])
+    count: int = Field(description="number of readings", examples=[12])
     minimum: float = Field(description="smallest value", examples=[-0.251])
     mean: float = Field(description="mean value", examples=[-0.246])
     maximum: float = Field(description="largest value", examples=[-0.239])
@@ -89,8 +89,8 @@ class ReadingList(Record):
     """Readings of one quantity over time: one by one, or reduced to buckets of equal length."""
 
     quantity: str = Field(
-        description="parameter (relative change), equation (mean squared difference), level (of a channel, in the unit "
-        "that reports say) or a measure of the window: "
+        description="parameter (relative change), equation (mean squared difference), level (of a channel, in the "
+        "unit given in reports) or a measure of the window: "
         + ", ".join(f"{name} ({Report.model_fields[field].description})" for name, (field, _) in MEASURES.items()),
         examples=["parameter"],
     )
@@ -104,11 +104,11 @@ class ReadingList(Record):
 
 
 class Trend(OfMachine):
-    """One reading of one machine up to its newest window; n values each."""
+    """One reading of one machine over time, up to its newest window; n values each."""
 
     quantity: str = Field(description="as in the list of readings", examples=["parameter"])
     name: str = Field(description="which parameter, equation or level", examples=["k_by"])
-    length_ns: int | None = Field(description="of each bucket; null if there is none", examples=[1_800_000_000_000])
+    length_ns: int | None = Field(description="bucket length; null if there is none", examples=[1_800_000_000_000])
     starts_ns: tuple[int, ...] = Field(
         description="when each bucket begins; those without a reading are left out", examples=[(EXAMPLE_NS,)]
     )
@@ -116,7 +116,7 @@ class Trend(OfMachine):
 
 
 class TrendList(Record):
-    """What was asked for, in that order."""
+    """The requested trends."""
 
     trends: tuple[Trend, ...] = Field(description="one for each `of`, in that order")
 
@@ -126,18 +126,18 @@ class AuditRecord(Record):
 
     number: int = Field(description="counts the entries", examples=[291])
     at_ns: int = Field(
-        description="when the request arrived, this computer's time; the same before and after the operation",
+        description="when the request arrived, by this computer's clock; the same before and after the operation",
         examples=[EXAMPLE_NS],
     )
-    actor: str = Field(description="name of the token; empty for nobody in particular", examples=["anna"])
+    actor: str = Field(description="name of the caller's token; empty if there is none", examples=["anna"])
     address: str = Field(description="where the request came from", examples=["127.0.0.1"])
     method: str = Field(description="HTTP method", examples=["POST"])
     path: str = Field(description="path of the request", examples=["/api/v1/machines/demo/lab/alarms/k_by/acknowledge"])
     status: int = Field(description="HTTP status of the answer; 0 before the operation", examples=[200])
-    action: str = Field(description="operation, in one word; started before it is done", examples=["acknowledge"])
+    action: str = Field(description="operation, in one word; `started` before it is done", examples=["acknowledge"])
     machine: str = Field(description="site/machine it concerns; empty if none", examples=["demo/lab"])
     alarm: str = Field(description="alarm it concerns; empty if none", examples=["k_by"])
-    reason: str = Field(description="why, or why it was refused", examples=["seen, inspection is ordered"])
+    reason: str = Field(description="reason given, or why it was refused", examples=["seen, inspection is ordered"])
 
 
 class AuditList(Record):

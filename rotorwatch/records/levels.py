@@ -10,7 +10,7 @@ from rotorwatch.records.fields import Number, Record
 class LevelBound(Record):
     """Limits of one kind: of a standard, of the machine file, or relative to a reference."""
 
-    source: str = Field(description="where they come from", examples=["ISO 20816-3 group 2 rigid"])
+    source: str = Field(description="where the limits come from", examples=["ISO 20816-3 group 2 rigid"])
     zones: tuple[float, float, float] | None = Field(
         default=None, description="boundaries A/B, B/C and C/D of a standard; null without", examples=[(1.4, 2.8, 4.5)]
     )
@@ -20,7 +20,7 @@ class LevelBound(Record):
 
 
 class LevelLimits(Record):
-    """What one level is judged by, and what came of it."""
+    """Limits by which one level is judged, and its state."""
 
     measure: str = Field(description="which of the levels", examples=["overall"])
     alert: Number = Field(default=None, description="alert from here on; null without such a limit", examples=[2.8])
@@ -30,9 +30,9 @@ class LevelLimits(Record):
         description="where the nearest limit comes from", examples=["ISO 20816-3 group 2 rigid", "commissioned"]
     )
     absolute: bool = Field(
-        default=False, description="whether that is a limit of the machine file or of a standard", examples=[True]
+        default=False, description="whether `source` is the machine file or a standard", examples=[True]
     )
-    state: Literal["normal", "alert", "danger"] = Field(description="on which side of them it is", examples=["normal"])
+    state: Literal["normal", "alert", "danger"] = Field(description="state of the level", examples=["normal"])
     text: str = Field(
         default="",
         description="the level and the limit it is beyond, in words; empty while it is normal",
@@ -41,21 +41,21 @@ class LevelLimits(Record):
     bounds: tuple[LevelBound, ...] = Field(
         default=(),
         exclude_if=lambda value: not value,
-        description="each kind of limit, the farther ones too; left out where those above are the only ones and "
-        "there are no zones",
+        description="every kind of limit, including those that are not the nearest; left out if the limits above are "
+        "the only ones and there are no zones",
     )
 
 
 class LevelGrowth(Record):
-    """What growth of vibration would have been seen in a window that is called unchanged, or only watched."""
+    """Growth of vibration that would have raised an alert in a window reported as unchanged, or only watched."""
 
     growth: Number = Field(
         description="smallest growth, relative to the level of the window, with which every channel would have raised "
-        "an alert; null where one has no limit, so that no growth of it would have",
+        "an alert; null if a channel has no limit, so that no growth of it would have raised one",
         examples=[0.6],
     )
-    channel: str = Field(description="the channel that would have raised it last, or never", examples=["DE-H"])
-    measure: str = Field(description="the level of it that decides; empty without one", examples=["overall"])
+    channel: str = Field(description="channel that would have raised an alert last, or never", examples=["DE-H"])
+    measure: str = Field(description="deciding level of that channel; empty if there is none", examples=["overall"])
     text: str = Field(
         description="the same in words",
         examples=[
@@ -69,12 +69,12 @@ class ChannelLevels(Record):
     """Vibration levels of one channel in one window."""
 
     channel: str = Field(description="name of the channel", examples=["DE-H"])
-    unit: str = Field(description="unit of its levels, but for `velocity`", examples=["m/s2"])
+    unit: str = Field(description="unit of the levels, except `velocity`", examples=["m/s2"])
     detection: Literal["peak to peak", "rms"] = Field(
-        description="of overall and orders: displacement is peak to peak, all else rms", examples=["rms"]
+        description="of `overall` and the orders: peak to peak for a displacement, otherwise rms", examples=["rms"]
     )
     band_hz: tuple[float, float] | None = Field(
-        description="band of velocities; null where there are none", examples=[(10.0, 1000.0)]
+        description="frequency band of velocities; null for a displacement", examples=[(10.0, 1000.0)]
     )
     overall: Number = Field(description="overall level (ISO 20816-1)", examples=[1.93])
     velocity: Number = Field(
@@ -88,7 +88,7 @@ class ChannelLevels(Record):
     )
     peak: Number = Field(description="largest deviation from the mean: a true peak", examples=[6.4])
     x_half: Number = Field(
-        default=None, description="at half running speed; null if that is not known", examples=[0.02]
+        default=None, description="at half running speed; null if the speed is not known", examples=[0.02]
     )
     x1: Number = Field(default=None, description="at running speed", examples=[1.1])
     x1_phase_lag_deg: Number = Field(
@@ -97,22 +97,22 @@ class ChannelLevels(Record):
     x2: Number = Field(default=None, description="at twice running speed", examples=[0.3])
     x2_phase_lag_deg: Number = Field(default=None, description="phase lag of 2x", examples=[44.0])
     x3: Number = Field(default=None, description="at three times running speed", examples=[0.1])
-    not_x1: Number = Field(default=None, description="rms of what is not at running speed", examples=[1.6])
+    not_x1: Number = Field(default=None, description="rms without the part at running speed", examples=[1.6])
     mean: Number = Field(default=None, description="of a displacement: mean position (gap)", examples=[None])
     crest: Number = Field(default=None, description="crest factor: peak over rms", examples=[3.3])
-    kurtosis: Number = Field(default=None, description="3 of a Gaussian vibration", examples=[3.0])
+    kurtosis: Number = Field(default=None, description="kurtosis: 3 for a Gaussian vibration", examples=[3.0])
     high: Number = Field(default=None, description="of an accelerometer: rms above 1 kHz", examples=[0.8])
-    envelope: Number = Field(default=None, description="rms of the envelope of that", examples=[0.3])
+    envelope: Number = Field(default=None, description="rms of the envelope of the part above 1 kHz", examples=[0.3])
     growth: Number = Field(
         default=None,
-        description="of all bands of a twelfth of an octave the one nearest to its limit, times the reference; null "
-        "without one",
+        description="level of the twelfth-octave band nearest to its limit, over the reference; null without a "
+        "reference",
         examples=[1.1],
     )
     zone: Literal["", "A", "B", "C", "D"] = Field(
         default="", description="zone of the standard that applies; empty without one", examples=["B"]
     )
-    limits: tuple[LevelLimits, ...] = Field(default=(), description="limits of those levels that have any")
+    limits: tuple[LevelLimits, ...] = Field(default=(), description="limits of the levels that have any")
 
     def values(self) -> dict[str, float]:
         """Levels that have a value, by measure."""

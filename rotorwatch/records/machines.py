@@ -22,22 +22,22 @@ class Channel(Record):
         description="displacement, velocity, acceleration, tilt, tilt_rate or shaft_angle", examples=["displacement"]
     )
     location: str = Field(
-        description="bearing, disc or shaft; or a place with another name, of which only levels are watched",
+        description="bearing, disc or shaft; or a place with another name, at which only levels are watched",
         examples=["bearing"],
     )
     direction: str = Field(description="y, z or rotation; or another one, such as X with an angle", examples=["y"])
     unit: str = Field(description="unit of the samples", examples=["um"])
     angle_deg: float | None = Field(
         default=None,
-        description="angle of the sensor's axis from +y towards +z; null where its direction says it all",
+        description="angle of the sensor's axis from +y towards +z; null if `direction` defines the axis",
         examples=[None],
     )
 
 
 class MachineDescription(OfMachine):
-    """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
+    """A monitored machine: description, state, channels of its stream, and keys of its topics."""
 
-    description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
+    description: str = Field(description="as in the machine file", examples=["Rotor kit with an overhung disc"])
     state: State
     speed_rpm: float | None = Field(
         description="nominal speed, null where the machine file gives none", examples=[1320.0]
@@ -75,34 +75,34 @@ class MachineList(Record):
 
 
 class MachineConfiguration(OfMachine):
-    """What a machine is monitored with."""
+    """Machine file and bundle with which a machine is monitored."""
 
     file: dict[str, JsonValue] = Field(
-        description="the machine file, what it leaves out filled in", examples=[{"site": "demo", "name": "lab"}]
+        description="the machine file, with defaults filled in", examples=[{"site": "demo", "name": "lab"}]
     )
     bundle: BundleIdentity
     machine_hash: MachineHash
 
 
 class DetectableParameter(Record):
-    """What it takes to find a change of one parameter."""
+    """Smallest changes of one parameter that can be found, and the data needed to find a requested one."""
 
     name: ParameterName
     text: ParameterText
     loss: float = Field(description="smallest relative change downwards found in one window", examples=[-0.025])
     gain: float = Field(description="smallest relative change upwards found in one window", examples=[0.026])
     length_s: float | None = Field(
-        description="data it takes to find the wished `change`; null without a wish", examples=[16.0]
+        description="length of data needed to find the requested `change`; null if none is requested", examples=[16.0]
     )
 
 
 class DetectableChanges(OfMachine):
-    """What would be found on this machine as it runs now, with 95 % probability."""
+    """Changes that would be found with 95 % probability on this machine as it runs now."""
 
     window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[EXAMPLE_NS])
     window_length_s: float = Field(description="length of the window", examples=[60.0])
-    false_alarms_per_month: float = Field(description="declared in the machine file", examples=[1.0])
-    change: float | None = Field(description="relative change asked for; null without", examples=[-0.05])
+    false_alarms_per_month: float = Field(description="false-alarm rate declared in the machine file", examples=[1.0])
+    change: float | None = Field(description="requested relative change; null if none is requested", examples=[-0.05])
     parameters: tuple[DetectableParameter, ...] = Field(description="one entry per parameter that can be read")
     reason: str = Field(description="why there is no entry; empty otherwise", examples=[""])
     bundle: BundleIdentity

@@ -19,7 +19,7 @@ _Reason = Annotated[
     Field(
         max_length=_LONGEST_REASON,
         pattern=PRINTABLE,
-        description="why; it goes into the log of alarms and the audit log",
+        description="reason for the operation; it is written into the alarm log and the audit log",
         examples=["sensor cable is being replaced"],
     ),
 ]
@@ -33,7 +33,7 @@ _ExpectedState = Annotated[
 
 
 class OperationOrder(BaseModel):
-    """What an operator says when acknowledging, unshelving, resetting, or returning to service."""
+    """Request to acknowledge, unshelve or reset an alarm, or to return it to service."""
 
     model_config = REQUEST
 
@@ -42,7 +42,7 @@ class OperationOrder(BaseModel):
 
 
 class ReasonedOrder(BaseModel):
-    """What is said when taking an alarm out of service."""
+    """Request to take an alarm out of service."""
 
     model_config = REQUEST
 
@@ -51,7 +51,7 @@ class ReasonedOrder(BaseModel):
 
 
 class ShelveOrder(BaseModel):
-    """What an operator says when shelving."""
+    """Request to shelve an alarm."""
 
     model_config = REQUEST
 
@@ -60,17 +60,17 @@ class ShelveOrder(BaseModel):
         default=None,
         gt=0,
         allow_inf_nan=False,
-        description="for how long, data time; left out: as long as the machine file allows (`longest_shelf_s`)",
+        description="duration in data time; if left out, the longest that the machine file allows (`longest_shelf_s`)",
         examples=[3600.0],
     )
     one_shot: bool = Field(
-        default=False, description="end it when the condition clears, if that is earlier", examples=[False]
+        default=False, description="end shelving when the condition clears, if that is earlier", examples=[False]
     )
     expected_state: _ExpectedState = None
 
 
 class OperationDone(Record):
-    """What came of an operation."""
+    """Result of an operation."""
 
-    alarm: Alarm = Field(description="as it is afterwards; its version is the new ETag")
-    events: tuple[AlarmCloudEvent, ...] = Field(description="what happened")
+    alarm: Alarm = Field(description="alarm after the operation; its version is the new ETag")
+    events: tuple[AlarmCloudEvent, ...] = Field(description="events caused by the operation")

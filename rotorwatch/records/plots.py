@@ -13,7 +13,7 @@ from rotorwatch.records.fields import EXAMPLE_NS, OfMachine, Record
 
 _Series = tuple[float | None, ...]
 
-_Reason = Annotated[str, Field(description="why there is nothing, or less than asked for; else empty", examples=[""])]
+_Reason = Annotated[str, Field(description="why values are missing; empty if all are there", examples=[""])]
 
 _Speed = Annotated[
     float | None,
@@ -22,7 +22,7 @@ _Speed = Annotated[
 
 _Speeds = Annotated[
     _Series,
-    Field(description="speed of each, negative where the shaft turns from z to y", examples=[(62.8, 94.2, 138.23)]),
+    Field(description="speed of each value, negative for rotation from z to y", examples=[(62.8, 94.2, 138.23)]),
 ]
 
 _Times = Annotated[
@@ -30,7 +30,7 @@ _Times = Annotated[
     Field(description="time of each", examples=[(EXAMPLE_NS - 2_000_000_000, EXAMPLE_NS - 1_000_000_000, EXAMPLE_NS)]),
 ]
 
-_Location = Annotated[str, Field(description="place of two displacements", examples=["bearing"])]
+_Location = Annotated[str, Field(description="place at which two displacements are measured", examples=["bearing"])]
 
 
 class _Values(OfMachine):
@@ -41,9 +41,9 @@ class _Values(OfMachine):
 
 class _ValuesOfSamples(_Values):
     start_ns: int | None = Field(
-        default=None, description="time of the oldest data in it; null without", examples=[EXAMPLE_NS - 400_000_000]
+        default=None, description="beginning of the data used; null without data", examples=[EXAMPLE_NS - 400_000_000]
     )
-    end_ns: int | None = Field(default=None, description="end of the newest data in it", examples=[EXAMPLE_NS])
+    end_ns: int | None = Field(default=None, description="end of the data used", examples=[EXAMPLE_NS])
 
 
 class ChannelWaveform(Record):
@@ -51,7 +51,7 @@ class ChannelWaveform(Record):
 
     channel: str = Field(description="name of the channel", examples=["y1"])
     unit: str = Field(description="unit of the values", examples=["µm"])
-    mean: float | None = Field(description="mean that was taken away", examples=[0.12])
+    mean: float | None = Field(description="mean that was subtracted", examples=[0.12])
     values: _Series = Field(description="samples less their mean", examples=[(3.2, 4.1)])
 
 
@@ -59,7 +59,7 @@ class WaveformSnapshot(_ValuesOfSamples):
     """The newest whole revolutions, channel by channel."""
 
     speed_rad_s: _Speed = None
-    revolutions: int = Field(default=0, description="whole revolutions; 0 where none can be told", examples=[8])
+    revolutions: int = Field(default=0, description="whole revolutions; 0 if not known", examples=[8])
     times_s: tuple[float, ...] = Field(
         default=(), description="time of each sample after `start_ns`", examples=[(0.0, 0.0005)]
     )
@@ -73,7 +73,7 @@ class WaveformSnapshot(_ValuesOfSamples):
 
 
 class PlaceSpectrum(Record):
-    """Circles that the shaft's motion at one place adds up to; n_lines values."""
+    """Full spectrum at one place: diameters of the circles that add up to the shaft's motion; n_lines values."""
 
     location: _Location
     channels: tuple[str, ...] = Field(description="the two channels", examples=[("y1", "z1")])
@@ -82,7 +82,7 @@ class PlaceSpectrum(Record):
 
 
 class FullSpectrumSnapshot(_ValuesOfSamples):
-    """Full spectra: what goes round with the rotation, and what against it."""
+    """Full spectra: motion of the shaft in the direction of rotation (forward) and against it."""
 
     speed_rad_s: _Speed = None
     frequencies_hz: tuple[float, ...] = Field(
@@ -90,8 +90,8 @@ class FullSpectrumSnapshot(_ValuesOfSamples):
         description="n_lines values; positive is forward precession, or from y to z where the rotation is not known",
         examples=[(-22.0, 0.0, 22.0)],
     )
-    resolution_hz: float | None = Field(default=None, description="distance of the lines; null without", examples=[1.0])
-    averages: int = Field(default=0, description="half-overlapping Hann segments that were averaged", examples=[19])
+    resolution_hz: float | None = Field(default=None, description="line spacing; null if there is none", examples=[1.0])
+    averages: int = Field(default=0, description="number of half-overlapping Hann segments averaged", examples=[19])
     places: tuple[PlaceSpectrum, ...] = Field(default=(), description="place by place")
     reason: _Reason = ""
 
@@ -100,9 +100,9 @@ class WaterfallRow(Record):
     """One spectrum of a waterfall; n_bins values."""
 
     start_ns: int | None = Field(
-        description="oldest data in it; null over speed", examples=[EXAMPLE_NS - 1_000_000_000]
+        description="beginning of its data; null if ordered by speed", examples=[EXAMPLE_NS - 1_000_000_000]
     )
-    end_ns: int | None = Field(description="end of the newest; null over speed", examples=[EXAMPLE_NS])
+    end_ns: int | None = Field(description="end of its data; null if ordered by speed", examples=[EXAMPLE_NS])
     speed_rad_s: _Speed = None
     values: _Series = Field(description="amplitudes in `unit`", examples=[(0.8, 7.4)])
 
@@ -112,9 +112,9 @@ class WaterfallSnapshot(_ValuesOfSamples):
 
     channel: str = Field(default="", description="name of the channel; empty without one", examples=["y1"])
     unit: str = Field(default="", description="unit of the amplitudes", examples=["µm p-p"])
-    over: Literal["time", "speed"] = Field(description="what the rows go over", examples=["time"])
+    over: Literal["time", "speed"] = Field(description="whether rows are ordered by time or speed", examples=["time"])
     frequencies_hz: tuple[float, ...] = Field(default=(), description="n_bins values", examples=[(20.0, 22.0)])
-    resolution_hz: float | None = Field(default=None, description="distance of the lines; null without", examples=[2.0])
+    resolution_hz: float | None = Field(default=None, description="line spacing; null if there is none", examples=[2.0])
     rows: tuple[WaterfallRow, ...] = Field(default=(), description="the oldest, or slowest, first")
     reason: _Reason = ""
 
@@ -129,15 +129,15 @@ class ChannelVectors(Record):
 
 
 class VectorSeries(_Values):
-    """Vectors at an order of running speed over time and speed: what Bode and polar plots show."""
+    """Vectors at an order of running speed over time and speed, for Bode and polar plots."""
 
     order: int = Field(description="multiple of running speed", examples=[1])
     revolutions: int | None = Field(
-        default=None, description="that each vector is of; null where it is of a window of the monitor", examples=[None]
+        default=None, description="revolutions per vector; null for windows of the monitor", examples=[None]
     )
     slow_roll_rpm: float | None = Field(
         default=None,
-        description="the mean vector up to this speed was taken away; null if nothing was",
+        description="speed up to which the subtracted mean vector was taken; null if none was subtracted",
         examples=[None],
     )
     times_ns: _Times = ()
@@ -145,7 +145,7 @@ class VectorSeries(_Values):
     channels: tuple[ChannelVectors, ...] = Field(default=(), description="channel by channel")
     steady: str = Field(
         default="",
-        description="that the speeds are nearly the same, so that a Bode plot shows little; else empty",
+        description="note that the speeds are nearly the same, so that a Bode plot shows little; empty otherwise",
         examples=[""],
     )
     reason: _Reason = ""
@@ -161,7 +161,7 @@ class PlaceCentreline(Record):
 
 
 class CentrelineSeries(_Values):
-    """Where the shaft was on average, over time and speed (API 670: average shaft centreline)."""
+    """Average position of the shaft over time and speed (API 670: average shaft centreline)."""
 
     times_ns: _Times = ()
     speeds_rad_s: _Speeds = ()

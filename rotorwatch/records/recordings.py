@@ -18,19 +18,19 @@ class RecordingEntry(Record):
     complete: bool = Field(
         description="false for a file that is being written, or was left by a crash", examples=[True]
     )
-    kept_because: str = Field(description="which alarm keeps it beyond its time; empty if none", examples=[""])
+    kept_because: str = Field(description="alarm that keeps it longer; empty if none", examples=[""])
     problem: str = Field(description="why it cannot be read; empty if it can", examples=[""])
     data_start_ns: int | None = Field(
         default=None,
-        description="time of the earliest data, which a replay may begin from; null if incomplete or damaged, and in a "
-        "list unless asked for with `data_times`",
+        description="time of the earliest data, from which a replay may begin; null if incomplete or damaged, and in "
+        "a list unless requested with `data_times`",
         examples=[1767225600000000000],
     )
     data_end_ns: int | None = Field(default=None, description="end of the latest data", examples=[1767225900000000000])
 
 
 class RecordingDetail(RecordingEntry):
-    """One recording with what is in it: which data, of whatever time they were recorded."""
+    """One recording with its contents: messages by key, and the time span of the data."""
 
     keys: dict[str, int] = Field(
         description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]

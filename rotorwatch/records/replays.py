@@ -12,9 +12,9 @@ TOML_NAME = r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,94}\.toml$"
 
 
 class ReplayProgress(Record):
-    """How far a replay is."""
+    """Progress of a replay."""
 
-    fraction: float = Field(ge=0, le=1, description="of the stretch to be replayed; 1 at its end", examples=[0.5])
+    fraction: float = Field(ge=0, le=1, description="fraction of the data replayed; 1 at the end", examples=[0.5])
     position_ns: int = Field(description="time that the data have reached", examples=[1767225805000000000])
     messages: int = Field(description="messages read so far", examples=[3000])
     windows: int = Field(description="windows evaluated so far; 0 if the replay only publishes", examples=[60])
@@ -35,22 +35,22 @@ class OfflineSummary(Record):
     """What an offline replay found."""
 
     site: str = Field(description="site of the machine whose file was used", examples=["demo"])
-    machine: str = Field(description="its name", examples=["lab"])
+    machine: str = Field(description="name of the machine", examples=["lab"])
     bundle: str | None = Field(
         description="identity of the trained networks; null without", examples=["lab-3f9c1e0b7a52"]
     )
     machine_hash: str = Field(description="changes with the machine file's content", examples=["9a0c41d27be8"])
-    windows: int = Field(description="window reports", examples=[119])
+    windows: int = Field(description="number of window reports", examples=[119])
     skipped_windows: int = Field(
-        default=0, description="windows not evaluated, as by the monitor when they were recorded", examples=[0]
+        default=0, description="windows not evaluated, as by the monitor during the recording", examples=[0]
     )
-    alarms: int = Field(description="alarm events", examples=[1])
+    alarms: int = Field(description="number of alarm events", examples=[1])
     raised: tuple[str, ...] = Field(description="alarms raised at the end", examples=[["k_by"]])
     blocks: int = Field(description="blocks accepted", examples=[6000])
     refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"overlap": 1}])
     last_refusal: str = Field(description="latest reason for refusing a block; empty if none was", examples=[""])
-    gaps: int = Field(description="interruptions before accepted blocks", examples=[0])
-    missing_s: float = Field(description="data time that the gaps cost", examples=[0.0])
+    gaps: int = Field(description="gaps: interruptions before accepted blocks", examples=[0])
+    missing_s: float = Field(description="data time lost in gaps", examples=[0.0])
     data_s: float = Field(description="length of the accepted blocks", examples=[600.0])
     elapsed_s: float = Field(description="how long the replay took", examples=[12.0])
     times_real_time: float = Field(description="data_s over elapsed_s", examples=[50.0])
@@ -59,10 +59,10 @@ class OfflineSummary(Record):
     )
     limits: dict[str, ParameterLimits] = Field(
         default={},
-        description="limits that held, by parameter; those of levels are in the reports",
+        description="limits in use, by parameter; those of levels are in the reports",
         examples=[{"k_by": {"raise_above": 0.1, "clear_below": 0.06, "danger_above": 0.4}}],
     )
-    stopped: bool = Field(description="whether it was stopped before the end", examples=[False])
+    stopped: bool = Field(description="whether the replay was stopped before the end", examples=[False])
     sha256: str = Field(description="SHA-256 of all result lines, each with its line end", examples=["9f86d081"])
 
 
@@ -87,7 +87,8 @@ class ReplayRequest(BaseModel):
     )
     mode: Literal["offline", "paced"] = Field(
         default="offline",
-        description="offline: through a monitor of its own at full speed; paced: onto the network below `prefix`",
+        description="offline: evaluated by a separate monitor at full speed; paced: published on the network below "
+        "`prefix`",
         examples=["offline"],
     )
     machine: str | None = Field(
@@ -98,14 +99,14 @@ class ReplayRequest(BaseModel):
     machine_file: str | None = Field(
         default=None,
         max_length=100_000,
-        description="offline: text of another machine file, of the machine that was recorded; instead of `machine`. "
-        "What the monitored machine was commissioned with goes with it, trained networks only as `bundle` names them",
+        description="offline: text of another machine file for the recorded machine, instead of `machine`. It is used "
+        "with the commissioning of the monitored machine; trained networks are used only if `bundle` names them",
         examples=[None],
     )
     machine_file_name: str = Field(
         default="sent.toml",
         pattern=TOML_NAME,
-        description="what the replay calls that file",
+        description="name by which the replay refers to `machine_file`",
         examples=["stricter.toml"],
     )
     bundle: str | None = Field(
@@ -116,7 +117,7 @@ class ReplayRequest(BaseModel):
     changes: tuple[Annotated[str, Field(max_length=500)], ...] = Field(
         default=(),
         max_length=100,
-        description="offline: lines that hold instead of the machine file's, FIELD=VALUE as in TOML",
+        description="offline: lines that override those of the machine file, FIELD=VALUE as in TOML",
         examples=[["alarms.parameters.k_by.raise_above=0.2", "alarms.on_delay_s=60.0"]],
     )
     from_ns: int | None = Field(
@@ -133,26 +134,26 @@ class ReplayRequest(BaseModel):
 class ReplayJob(Record):
     """A replay that was started over HTTP."""
 
-    id: str = Field(description="names the replay until the service stops", examples=["5f2b9c0d1a7e"])
+    id: str = Field(description="identifies the replay until the service stops", examples=["5f2b9c0d1a7e"])
     state: Literal["running", "paused", "finished", "stopped", "failed"] = Field(
-        description="finished: came to its end; stopped: was told to; failed: `error` says why", examples=["finished"]
+        description="finished: reached the end; stopped: ended on request; failed: see `error`", examples=["finished"]
     )
     mode: Literal["offline", "paced"] = Field(description="as requested", examples=["offline"])
     recordings: tuple[str, ...] = Field(
         description="ids of the recordings", examples=[["demo/lab/20260101T000000Z.mcap"]]
     )
     machine: str | None = Field(
-        description="machine file and, after @, trained networks it is evaluated with; null: by the recorded name",
+        description="machine file and, after @, bundle for the evaluation; null: chosen by the recorded name",
         examples=["lab@lab"],
     )
     machine_file_sent: bool = Field(
         default=False,
         exclude_if=lambda value: not value,
-        description="whether that file was sent with the request; left out otherwise",
+        description="true if the machine file was sent with the request; left out otherwise",
         examples=[True],
     )
     changes: tuple[str, ...] = Field(
-        default=(), description="lines that hold instead of the machine file's", examples=[["alarms.on_delay_s=60.0"]]
+        default=(), description="lines that override those of the machine file", examples=[["alarms.on_delay_s=60.0"]]
     )
     from_ns: int | None = Field(description="as requested", examples=[1767225600000000000])
     to_ns: int | None = Field(description="as requested", examples=[1767225900000000000])
@@ -160,17 +161,17 @@ class ReplayJob(Record):
         default=None, description="seconds of data per second; null: as fast as possible", examples=[None]
     )
     prefix: str = Field(
-        description="paced: what goes before every key, and the namespace of a monitor for it; empty offline",
+        description="paced: prefix of every key, and namespace of a monitor for the replay; empty if offline",
         examples=[""],
     )
     started_ns: int = Field(description="when it was started, by this computer's clock", examples=[1767312000000000000])
-    progress: ReplayProgress | None = Field(description="how far it is; null before the first message")
-    summary: OfflineSummary | None = Field(description="what was found; null before the end, and if paced")
-    error: str = Field(description="why it failed; else empty", examples=[""])
+    progress: ReplayProgress | None = Field(description="progress; null before the first message")
+    summary: OfflineSummary | None = Field(description="results; null before the end, and if paced")
+    error: str = Field(description="why it failed; empty otherwise", examples=[""])
 
 
 class ReplaySeek(BaseModel):
-    """Where a replay is to go on: a time, or a distance from where it is."""
+    """Position from which a replay continues: a time, or an offset from the current position."""
 
     model_config = ConfigDict(
         **REQUEST,
@@ -186,7 +187,7 @@ class ReplaySeek(BaseModel):
         default=None,
         ge=-1e9,
         le=1e9,
-        description="seconds from where it is, back if negative; give this or `to_ns`",
+        description="offset from the current position, back if negative; give this or `to_ns`",
         examples=[None],
     )
 

@@ -5,7 +5,7 @@ from typing import Self
 
 
 class FaultKind(StrEnum):
-    """Kind of a sensor's fault."""
+    """Kind of a sensor fault."""
 
     text: str  # in words, for the alarm
     measure: str  # unit or meaning of the value of such a fault

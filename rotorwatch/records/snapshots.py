@@ -44,15 +44,14 @@ class PredictedChange(Record):
 
 
 class Theory(Record):
-    """What the predictions are of.
+    """Basis of the predictions.
 
-    The excitation is not measured. It is the one that explains the window best with the machine as estimated (as
-    nominal, where there is no estimate), and the same for both predictions: what they differ by is what the parameters
-    have changed.
+    The excitation is not measured. It is estimated as the one that explains the window best with the machine as
+    estimated (as nominal, if there is no estimate). Both predictions use it, and so differ only in the parameters.
     """
 
     changes: tuple[PredictedChange, ...] = Field(
-        description="parameters of the machine as estimated, from the latest reading; the others are nominal"
+        description="parameters of the machine as estimated, from the latest reading; all others are nominal"
     )
     nominal_reason: str = Field(
         description="why there is no prediction for the machine as nominal; empty if there is", examples=[""]
@@ -71,22 +70,22 @@ class CorrelationPair(Record):
     measured: _Series = Field(description="estimated in the window", examples=[(94.31, 93.67, 91.77)])
     standard_error: _Series = Field(description="standard error of `measured`", examples=[(3.37, 3.31, 3.19)])
     nominal: _Series | None = Field(
-        description="what theory predicts for the machine as nominal; null without, see `theory`",
+        description="prediction for the machine as nominal; null if there is none, see `theory`",
         examples=[(96.02, 95.36, 93.41)],
     )
     estimated: _Series | None = Field(
-        description="what theory predicts for the machine as now estimated; null without, see `theory`",
+        description="prediction for the machine as now estimated; null if there is none, see `theory`",
         examples=[(94.90, 94.25, 92.34)],
     )
     nominal_z: float | None = Field(
-        description="root mean square over the lags of `measured` less `nominal`, in standard errors; about 1 where "
-        "theory holds, but neighbouring lags err together, so that 2 is nothing unusual",
+        description="root mean square over the lags of `measured` less `nominal`, in standard errors; about 1 if "
+        "theory holds, but errors of neighbouring lags are correlated, so that 2 is not unusual",
         examples=[1.1],
     )
     estimated_z: float | None = Field(description="the same for `estimated`", examples=[0.9])
     outside_band: float | None = Field(
-        description="where `method` is spectrum: what the band leaves out at lag zero, over the product of the two "
-        "channels' rms; null otherwise",
+        description="if `method` is spectrum: part of the correlation at lag zero outside the band, over the product "
+        "of the two channels' rms; null otherwise",
         examples=[0.004],
     )
 
@@ -96,30 +95,30 @@ class CorrelationSnapshot(_OfWindow):
 
     lags_s: tuple[float, ...] = Field(description="τ, n_lags values from 0 on", examples=[(0.0, 0.001, 0.002)])
     method: Literal["samples", "spectrum"] = Field(
-        description="samples: from the samples themselves, standard errors from the scatter of the window's hops. "
-        "spectrum: transformed from the window's spectra, where the monitor needs no lags itself; what lies outside "
-        "`band_hz` is missing in measured and predicted values alike, and the standard errors come from the spectra",
+        description="samples: computed from the samples, with standard errors from the scatter of the window's hops. "
+        "spectrum: transformed from the window's spectra, if the monitor itself needs no lags; frequencies outside "
+        "`band_hz` are missing from both measured and predicted values, and the standard errors come from the spectra",
         examples=["samples"],
     )
     band_hz: tuple[float, float] | None = Field(
-        description="what the values are limited to; null where `method` is samples", examples=[None]
+        description="frequency band to which the values are limited; null if `method` is samples", examples=[None]
     )
     pairs: tuple[CorrelationPair, ...] = Field(description="pair by pair")
-    theory: Theory = Field(description="what the predictions are of")
+    theory: Theory = Field(description="basis of the predictions")
     reason: _Reason
     bundle: BundleIdentity
     machine_hash: MachineHash
 
 
 class ChannelDensity(Record):
-    """One-sided power spectral density (mean square per hertz, no amplitude) without mean and 1×; n_lines values."""
+    """One-sided power spectral density (mean square per hertz, not amplitude) without mean and 1×; n_lines values."""
 
     channel: str = Field(description="name of the channel", examples=["y2"])
-    quantity: str = Field(description="what it measures", examples=["displacement"])
+    quantity: str = Field(description="quantity that the channel measures", examples=["displacement"])
     unit: _DensityUnit
     measured: _Series = Field(description="estimated in the window", examples=[(0.231, 0.198, 0.212)])
     nominal: _Series | None = Field(
-        description="what theory predicts for the machine as nominal, sensor noise included; null without: `theory`",
+        description="prediction for the machine as nominal, sensor noise included; null if there is none, see `theory`",
         examples=[(0.214, 0.215, 0.216)],
     )
     estimated: _Series | None = Field(
@@ -138,18 +137,18 @@ class CrossSpectrum(Record):
     unit: _DensityUnit
     magnitude: _Series = Field(description="magnitude of the cross-spectrum", examples=[(0.116, 0.101, 0.109)])
     phase_deg: _Series = Field(
-        description="by how much channel j leads channel i, -180 to 180°", examples=[(-0.8, 1.1, 0.3)]
+        description="phase by which channel j leads channel i, -180 to 180°", examples=[(-0.8, 1.1, 0.3)]
     )
     coherence: _Series = Field(description="coherence squared, 0 to 1", examples=[(0.41, 0.38, 0.44)])
     nominal_magnitude: _Series | None = Field(
-        description="magnitude that theory predicts for the machine as nominal; null without, see `theory`",
+        description="predicted magnitude for the machine as nominal; null if there is none, see `theory`",
         examples=[(0.110, 0.110, 0.111)],
     )
     nominal_coherence: _Series | None = Field(
         description="coherence squared of the same", examples=[(0.40, 0.40, 0.40)]
     )
     estimated_magnitude: _Series | None = Field(
-        description="magnitude for the machine as now estimated", examples=[(0.111, 0.111, 0.112)]
+        description="predicted magnitude for the machine as now estimated", examples=[(0.111, 0.111, 0.112)]
     )
     estimated_coherence: _Series | None = Field(
         description="coherence squared of the same", examples=[(0.41, 0.41, 0.41)]
@@ -161,31 +160,30 @@ class SpectrumSnapshot(_OfWindow):
 
     frequencies_hz: tuple[float, ...] = Field(description="n_lines values", examples=[(3.0, 3.2, 3.4)])
     line_spacing_hz: float | None = Field(
-        description="distance of the lines; null without a window. The segments have a Hann window: a line sees 1.5 "
-        "distances of the segments' own lines",
+        description="line spacing; null without a window. The segments have a Hann window, so that each of their "
+        "lines has a noise bandwidth of 1.5 times their own spacing",
         examples=[0.2],
     )
-    averaged_lines: int = Field(description="lines of the segments that were averaged into one", examples=[1])
+    averaged_lines: int = Field(description="number of adjacent lines of the segments averaged into one", examples=[1])
     degrees_of_freedom: float | None = Field(
-        description="of every density: measured over true is distributed as χ² over its degrees of freedom",
+        description="degrees of freedom of every density: measured over true is distributed as χ² divided by them",
         examples=[45.5],
     )
     interval_95: tuple[float, float] | None = Field(
-        description="factors on a measured density between which the true one lies, with 95 % probability",
+        description="factors on a measured density between which the true one lies with 95 % probability",
         examples=[(0.69, 1.57)],
     )
     coherence_95: float | None = Field(
-        description="coherence squared that two channels with nothing in common exceed in 5 % of all lines",
-        examples=[0.129],
+        description="coherence squared that two incoherent channels exceed in 5 % of all lines", examples=[0.129]
     )
-    rotation_hz: float | None = Field(description="1×, taken out of the densities; null if not known", examples=[22.0])
+    rotation_hz: float | None = Field(description="1×, removed from the densities; null if not known", examples=[22.0])
     left_out_hz: tuple[float, float] | None = Field(
-        description="lines around 1× where what is left of it may show; null if the speed is not known",
+        description="band around 1× in which a remainder of it may show; null if the speed is not known",
         examples=[(21.4, 22.6)],
     )
     densities: tuple[ChannelDensity, ...] = Field(description="channel by channel")
-    cross: tuple[CrossSpectrum, ...] = Field(description="pair by pair, those asked for")
-    theory: Theory = Field(description="what the predictions are of")
+    cross: tuple[CrossSpectrum, ...] = Field(description="pair by pair, as requested")
+    theory: Theory = Field(description="basis of the predictions")
     reason: _Reason
     bundle: BundleIdentity
     machine_hash: MachineHash
@@ -195,19 +193,20 @@ class RunningSpeedVector(Record):
     """Vibration of one channel at running speed."""
 
     channel: str = Field(
-        description="name of the channel; of two at an angle, which are turned to y and z: 'y of VE-1X and VE-1Y'",
+        description="name of the channel; of two probes at an angle, resolved into y and z, such as 'y of VE-1X and "
+        "VE-1Y'",
         examples=["y1"],
     )
     amplitude: float = Field(
-        description="peak amplitude, in `unit` of the orbit; twice it is peak to peak", examples=[8.1]
+        description="peak amplitude (half of peak to peak), in `unit` of the orbit", examples=[8.1]
     )
     amplitude_error: float | None = Field(
         description="standard error of the amplitude, from the scatter of the hops; null if it is not known",
         examples=[0.05],
     )
     phase_lag_deg: float | None = Field(
-        description="how far the shaft turns from the phase reference's mark to the positive peak, 0 to 360°; null "
-        "without a phase reference",
+        description="angle by which the shaft turns from the phase reference's mark to the positive peak, 0 to 360°; "
+        "null without a phase reference",
         examples=[21.3],
     )
     phase_error_deg: float | None = Field(description="standard error of the phase lag", examples=[0.4])
@@ -222,11 +221,11 @@ class OrbitEllipse(Record):
         description="angle from y, towards z, to the long axis, above -90 and up to 90°", examples=[12.0]
     )
     sense: Literal["y to z", "z to y"] = Field(
-        description="which way the shaft's centre goes round the orbit", examples=["y to z"]
+        description="direction in which the shaft's centre travels round the orbit", examples=["y to z"]
     )
     precession: Literal["forward", "backward"] | None = Field(
-        description="forward: that is the way the shaft turns; null where the way it turns is not known, without a "
-        "phase reference",
+        description="forward: in the direction of rotation of the shaft; null without a phase reference, when that "
+        "direction is not known",
         examples=["forward"],
     )
 
@@ -242,25 +241,26 @@ class PathSamples(Record):
 class PlaceOrbit(Record):
     """Orbit at one place."""
 
-    location: str = Field(description="bearing, disc, or another place of two displacements", examples=["bearing"])
+    location: str = Field(description="bearing, disc, or another place with two displacements", examples=["bearing"])
     unit: str = Field(description="unit of all lengths: that of the y channel, or m", examples=["um"])
     y: RunningSpeedVector | None = Field(description="y channel at running speed; null without a window")
     z: RunningSpeedVector | None = Field(description="z channel at running speed; null without a window")
     ellipse: OrbitEllipse | None = Field(
-        description="measured in the window, elsewhere than at bearing and disc in `path`; null without, see `reason`"
+        description="ellipse measured in the window, or in `path` at places other than bearing and disc; null if "
+        "there is none, see `reason`"
     )
     nominal: OrbitEllipse | None = Field(
-        description="what the unbalance of the machine as nominal makes; null without, see `theory`"
+        description="ellipse that the unbalance causes on the machine as nominal; null if there is none, see `theory`"
     )
     estimated: OrbitEllipse | None = Field(description="the same for the machine as now estimated")
-    path: PathSamples | None = Field(description="samples as measured; null without, see `path_reason`")
+    path: PathSamples | None = Field(description="samples as measured; null if there are none, see `path_reason`")
 
 
 class OrbitSnapshot(_OfWindow):
     """Orbits at all places where displacements are measured in both directions."""
 
     speed_source: Literal["phase reference", "estimated", "unknown"] = Field(
-        description="where the speed is from; estimated: from the line in the vibration", examples=["phase reference"]
+        description="source of the speed; estimated: from the line in the vibration", examples=["phase reference"]
     )
     orbits: tuple[PlaceOrbit, ...] = Field(description="place by place")
     revolutions: int = Field(description="whole revolutions in `path`, 0 without", examples=[8])
@@ -271,7 +271,7 @@ class OrbitSnapshot(_OfWindow):
         description="when the shaft angle was 0, after `path_start_ns`: revolutions + 1 values",
         examples=[(0.0, 0.0455)],
     )
-    theory: Theory = Field(description="what the predictions are of")
+    theory: Theory = Field(description="basis of the predictions")
     reason: str = Field(description="why there is no ellipse; empty if there is", examples=[""])
     path_reason: str = Field(description="why there is no path, or a shorter one; empty otherwise", examples=[""])
     bundle: BundleIdentity
