@@ -2,8 +2,8 @@
 
 ::
 
-    middleware   token, rate, origin -----------> 401, 403, 413, 415, 429   (all but /healthz and the page)
-    gate         scopes of the route, audit log -> 403, 503                 (before the route's own code)
+    middleware   token, rate, origin, body size ------------> 401, 403, 413, 429, 503   (no token for public paths)
+    gate         scopes of the route, body type, audit log -> 403, 415, 503             (before the route's own code)
     route        dependencies=[guard.read], or caller: Annotated[Caller, guard.operate]
 
 A route that declares no scope is refused by the gate. How an application is guarded::

@@ -26,7 +26,7 @@ _BEGINNING = ["api", "v1"]
 _LIKENESS = 0.6
 _LONGEST_PATH = 128
 _HEADERS: dict[int, dict[str, Any]] = {
-    401: {"WWW-Authenticate": {"description": "how to show who you are", "schema": {"type": "string"}}},
+    401: {"WWW-Authenticate": {"description": "how to authenticate", "schema": {"type": "string"}}},
     429: {"Retry-After": {"description": "seconds to wait", "schema": {"type": "integer"}}},
 }
 # As in RFC 9110; Python's own words for them depend on its version.

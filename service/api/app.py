@@ -32,20 +32,20 @@ from service.stream.monitored import Monitored, NoAnswerError
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
 
-A token with the scope of the route is needed for everything but `/healthz`. Errors are problem details (RFC 9457).
+Every route listed here except `/healthz` needs a token with its scope. Errors are problem details (RFC 9457).
 Times in ns count from 1970-01-01 UTC.
 """
 _TAGS = [
-    {"name": "machines", "description": "What is monitored, and its state."},
-    {"name": "alarms", "description": "What needs attention, and what operators do about it."},
-    {"name": "history", "description": "What has happened and was read, and who asked for what."},
+    {"name": "machines", "description": "Monitored machines and their state."},
+    {"name": "alarms", "description": "Alarms, and operators' actions on them."},
+    {"name": "history", "description": "Past alarms, reports and readings."},
     {
         "name": "snapshots",
-        "description": "What the monitor holds now, or what was recorded: correlations, spectra, orbits, plots.",
+        "description": "Correlations, spectra, orbits and plots, of the newest data or of recordings.",
     },
-    {"name": "events", "description": "What happens, as it happens."},
+    {"name": "events", "description": "Alarm events and changes of health as they happen."},
     {"name": "recordings", "description": "Recorded streams."},
-    {"name": "replays", "description": "Recordings sent through a monitor of their own, apart from what is live."},
+    {"name": "replays", "description": "Recordings evaluated again or published again, apart from live data."},
     {"name": "service", "description": "The monitor itself."},
 ]
 _SMALLEST_CHANGE = 1e-6
@@ -136,19 +136,19 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
     @app.get(f"{PLACE}/configuration", responses=responses(MachineConfiguration, 404, 422, shown=lab), **common)
     def configuration(view: InPath) -> MachineConfiguration:
-        """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
+        """The machine file in use, with defaults filled in, and the identity of its bundle."""
         return MachineConfiguration(
             **view.identity, file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json")
         )
 
     @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)
     def health(view: InPath) -> Health:
-        """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
+        """Current health of a machine: state, report of the latest window, alarms, quality of the data."""
         return view.health()
 
     @app.get(f"{PLACE}/detectable", responses=responses(DetectableChanges, 404, 422), **common)
     def detectable(view: InPath, change: _Change = None) -> DetectableChanges:
-        """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
+        """Smallest changes that one window would show as the machine runs now, and data needed for a requested one."""
         return view.detectable(change)
 
 
@@ -164,17 +164,17 @@ def _add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         },
     )
     def metrics() -> Response:
-        """Numbers for Prometheus; a list of them is in the documentation."""
+        """Metrics for Prometheus, which the documentation lists."""
         return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     @app.get("/api/v1/webhooks", tags=["service"], dependencies=[guard.read], responses=responses(WebhookList))
     def webhooks() -> WebhookList:
-        """Programs that are told of alarm events, and whether they take them."""
+        """Programs that receive alarm events (webhooks), and the state of delivery."""
         return service.webhooks.statuses()
 
     @app.get("/api/v1/settings", tags=["service"], dependencies=[guard.configure], responses=responses(SettingList))
     def settings() -> SettingList:
-        """Settings of the monitor as they are in use, without those that may hold a secret."""
+        """Settings of the monitor in use, without those that may hold a secret."""
         return SettingList(settings=service.settings.shown)
 
 
@@ -188,7 +188,7 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         "/readyz", tags=["service"], dependencies=[guard.read], responses=responses(Readiness), response_model=Readiness
     )
     def readyz(request: Request) -> Readiness | JSONResponse:
-        """Whether the service can do its work, and if not, why; a machine without data is listed, not counted."""
+        """Whether the service can do its work, and if not, why; machines without data do not make it unready."""
         readiness = service.readiness()
         if readiness.ready:
             return readiness

@@ -47,12 +47,12 @@ _Replay = Annotated[
     str | None,
     Query(
         pattern=form("^[0-9a-f]{12}$", "the id of a replay, such as 4dedec2483d3"),
-        description="id of a replay of this machine, for its recordings, machine file and what it read",
+        description="id of a replay of this machine, whose recordings, machine file and readings are used",
     ),
 ]
-_From = Annotated[int | None, time_query("of recorded samples, those from this time on")]
-_To = Annotated[int | None, time_query("of recorded samples, those before this time")]
-_End = Annotated[int | None, time_query("of recorded samples, what ends then")]
+_From = Annotated[int | None, time_query("only recorded samples from this time on")]
+_To = Annotated[int | None, time_query("only recorded samples before this time")]
+_End = Annotated[int | None, time_query("end of the recorded samples to use")]
 
 
 @dataclass(frozen=True, slots=True)

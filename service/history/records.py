@@ -167,7 +167,7 @@ class Retention(BaseModel, extra="forbid", frozen=True):
         default=90.0, gt=0.0, le=36_500.0, description="how long every single reading is kept, in days"
     )
     bucket_s: int = Field(
-        default=600, ge=1, le=86_400, description="length of the stretch that readings are reduced to, in seconds"
+        default=600, ge=1, le=86_400, description="length of the buckets that readings are reduced to, in seconds"
     )
     buckets_days: float = Field(
         default=3650.0, gt=0.0, le=36_500.0, description="how long these reduced readings are kept, in days"

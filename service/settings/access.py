@@ -13,10 +13,10 @@ from models.signals.link import is_address, is_loopback
 class HttpTlsSettings(BaseModel, extra="forbid", frozen=True):
     """Certificate and key of the HTTP API, PEM files relative to the settings file; TLS 1.2 or newer."""
 
-    certificate: Path = Field(description="the service's certificate, followed by those that lead to its authority")
+    certificate: Path = Field(description="certificate of the service, then those up to its authority")
     key: Path = Field(description="private key, without a password and not readable by others")
     client_ca: Path | None = Field(
-        default=None, description="authorities of clients; with it, clients without such a certificate are refused"
+        default=None, description="authorities of clients; if set, clients without a certificate of theirs are refused"
     )
 
 
@@ -26,26 +26,26 @@ class LimitSettings(BaseModel, extra="forbid", frozen=True):
     body_bytes: int = Field(default=1_000_000, ge=1_000, le=1_000_000_000, description="largest request body, in bytes")
     requests_per_minute: int = Field(default=600, ge=1, le=1_000_000, description="most requests of one caller")
     failures_per_minute: int = Field(
-        default=10, ge=1, le=100_000, description="most attempts with a wrong token, and of an address with wrong ones"
+        default=10, ge=1, le=100_000, description="most attempts with one wrong token, or with any from one address"
     )
     streams_per_caller: int = Field(default=5, ge=1, le=10_000, description="most open event streams of one caller")
     streams: int = Field(default=50, ge=1, le=100_000, description="most open event streams in all")
     refusals_recorded_per_minute: int = Field(
-        default=5, ge=1, le=1_000, description="most refused requests of one address that the audit log takes"
+        default=5, ge=1, le=1_000, description="most refused requests of one address that are written to the audit log"
     )
 
 
 class AccessSettings(BaseModel, extra="forbid", frozen=True):
-    """Who may use the HTTP API; without anything here a token is needed for all but ``/healthz``."""
+    """Who may use the HTTP API; by default a token is needed for all but ``/healthz``, ``/`` and the page's files."""
 
     open_on_loopback: bool = Field(
         default=False, description="everybody on this computer may do everything without a token"
     )
     hosts: tuple[str, ...] = Field(
-        default=(), description="names by which browsers reach the API, if not localhost, the host or an address"
+        default=(), description="names by which browsers reach the API, other than localhost, the host or an address"
     )
     proxies: tuple[str, ...] = Field(
-        default=(), description="addresses of proxies that are believed when they say who the caller is"
+        default=(), description="addresses or networks of proxies that are trusted to say who the caller is"
     )
     tls: HttpTlsSettings | None = Field(default=None, description="certificate; plain HTTP without it")
     limits: LimitSettings = Field(default=LimitSettings(), description="how much one caller may ask for")

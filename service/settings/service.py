@@ -29,7 +29,7 @@ _SHOWN = {"http", "queue", "shards", "recording", "replay", "log"}
 
 
 class HttpSettings(BaseModel, extra="forbid", frozen=True):
-    """Where the HTTP API is served, to how many at once, and how long it waits for them."""
+    """Address, connection limits and timeouts of the HTTP API."""
 
     host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
 
@@ -62,7 +62,7 @@ class HttpSettings(BaseModel, extra="forbid", frozen=True):
         default=60.0, ge=0.1, le=86_400.0, description="longest time until its body has arrived, in seconds"
     )
     send_timeout_s: float = Field(
-        default=60.0, ge=0.1, le=86_400.0, description="longest time without any of an answer being taken, in seconds"
+        default=60.0, ge=0.1, le=86_400.0, description="longest time for which a reader takes nothing, in seconds"
     )
 
 
@@ -73,9 +73,9 @@ class MachineEntry(BaseModel, extra="forbid", frozen=True):
     bundle: str | None = Field(
         default=None,
         min_length=1,
-        description="trained networks or what was commissioned: shipped bundle by name, or folder relative to the "
-        "settings file; without one only levels are watched of a machine whose parameters are not known, and others "
-        "are monitored without networks",
+        description="bundle with trained networks or commissioning: shipped name, or folder relative to the settings "
+        "file. Without one, only the levels of a machine with unknown parameters are watched; others are monitored "
+        "without networks",
     )
 
     def load(self) -> MachineFile:
@@ -99,11 +99,11 @@ class QueueSettings(BaseModel, extra="forbid", frozen=True):
 
     blocks: int = Field(default=1500, ge=1, le=1_000_000, description="most blocks that wait, per machine")
     mb: float = Field(default=64.0, gt=0, le=100_000, description="most megabytes that wait, per machine")
-    when_full: Literal["drop", "wait"] = Field(default="drop", description="what happens to a block beyond that")
+    when_full: Literal["drop", "wait"] = Field(default="drop", description="what happens to further blocks")
 
 
 class HistorySettings(BaseModel, extra="forbid", frozen=True):
-    """Where reports, alarms and what a restart needs are kept, and for how long."""
+    """Where reports, alarms and the data for a restart are kept, and for how long."""
 
     url: str | None = Field(
         default=None,
@@ -112,7 +112,7 @@ class HistorySettings(BaseModel, extra="forbid", frozen=True):
         "sqlite:///:memory: keeps nothing beyond the end of the program. Left out: history.sqlite in the user's state "
         "folder",
     )
-    retention: Retention = Field(default=Retention(), description="how long what is kept; alarms are kept for ever")
+    retention: Retention = Field(default=Retention(), description="how long records are kept; alarms are kept for ever")
 
     @field_validator("url")
     @classmethod
@@ -141,7 +141,7 @@ class HistorySettings(BaseModel, extra="forbid", frozen=True):
 
 
 class RecordingSettings(BaseModel, extra="forbid", frozen=True):
-    """Where everything under the machines' keys is recorded, and what is kept; per machine, as far as sizes go.
+    """Where everything under the machines' keys is recorded, and what is kept; sizes are per machine.
 
     Whole files are kept or dropped. A file that reaches into the time around an alarm falls under the limits for alarms
     instead of the ordinary ones.
@@ -152,16 +152,16 @@ class RecordingSettings(BaseModel, extra="forbid", frozen=True):
     )
     rotate_s: float = Field(default=300.0, ge=1.0, le=86_400.0, description="longest time in one file, in seconds")
     rotate_mb: float = Field(default=256.0, ge=0.1, le=65_536.0, description="size at which a file is closed, in MB")
-    keep_gb: float = Field(default=20.0, gt=0.0, le=1e6, description="most that is kept without an alarm, in GB")
-    keep_days: float = Field(default=7.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    keep_gb: float = Field(default=20.0, gt=0.0, le=1e6, description="most kept of files without an alarm, in GB")
+    keep_days: float = Field(default=7.0, gt=0.0, le=36_500.0, description="how long these are kept, in days")
     alarm_before_s: float = Field(
         default=600.0, ge=0.0, le=86_400.0, description="time before an alarm event that is kept with it, in seconds"
     )
-    alarm_after_s: float = Field(default=600.0, ge=0.0, le=86_400.0, description="time after it, in seconds")
-    alarm_keep_gb: float = Field(default=40.0, gt=0.0, le=1e6, description="most that is kept for alarms, in GB")
-    alarm_keep_days: float = Field(default=365.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    alarm_after_s: float = Field(default=600.0, ge=0.0, le=86_400.0, description="the same after it, in seconds")
+    alarm_keep_gb: float = Field(default=40.0, gt=0.0, le=1e6, description="most kept of files with an alarm, in GB")
+    alarm_keep_days: float = Field(default=365.0, gt=0.0, le=36_500.0, description="how long these are kept, in days")
     queue_mb: float = Field(
-        default=64.0, ge=0.1, le=16_384.0, description="most that waits in memory for the disk, in MB"
+        default=64.0, ge=0.1, le=16_384.0, description="most data that wait in memory to be written, in MB"
     )
 
     @model_validator(mode="after")
@@ -180,13 +180,13 @@ class RecordingSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class ShardSettings(BaseModel, extra="forbid", frozen=True):
-    """Processes that share the machines: one computes on one core at a time."""
+    """Processes that share the machines; each computes on one core at a time."""
 
     count: int | None = Field(
         default=None,
         ge=1,
         le=1024,
-        description="how many there are; left out, one for every fifteen machines, and no more than there are cores",
+        description="number of processes; if left out, one for every fifteen machines, at most one per core",
     )
 
 
@@ -194,7 +194,7 @@ class FleetSettings(BaseModel, extra="forbid", frozen=True):
     """Where shards on other computers reach the process that serves their machines; only for ``rotorwatch fleet``."""
 
     listen: str = Field(
-        description='endpoint that all computers of the fleet reach, as "tcp/10.0.0.5:7448"; clients need a '
+        description='endpoint that all computers of the fleet reach, such as "tcp/10.0.0.5:7448"; clients need a '
         "password that is generated at each start"
     )
     tls: TlsSettings | None = Field(default=None, description='certificates, if listen begins with "tls/"')
@@ -211,11 +211,12 @@ class ReplaySettings(BaseModel, extra="forbid", frozen=True):
     """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
 
     enabled: bool | None = Field(
-        default=None, description="whether they may be started; if left out, only if the HTTP API stays on loopback"
+        default=None,
+        description="whether replays may be started; if left out, only if the HTTP API listens on loopback",
     )
-    jobs: int = Field(default=1, ge=1, le=64, description="most that run at once")
+    jobs: int = Field(default=1, ge=1, le=64, description="most replays that run at once")
     nice: int = Field(default=10, ge=0, le=19, description="by how much their priority is lowered, at most 19")
-    kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
+    kept: int = Field(default=20, ge=1, le=10_000, description="number of latest replays whose results are kept")
 
 
 class LogSettings(BaseModel, extra="forbid", frozen=True):
@@ -226,7 +227,7 @@ class LogSettings(BaseModel, extra="forbid", frozen=True):
 
 
 class ServiceSettings(BaseSettings):
-    """Everything the monitor can be told; without a file it watches the shipped machine ``lab``."""
+    """All settings of the monitor; without a file it monitors the shipped machine ``lab``."""
 
     model_config = SettingsConfigDict(
         extra="forbid", frozen=True, env_prefix=_ENV_PREFIX, env_nested_delimiter="__", validate_default=True

@@ -15,7 +15,7 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
 
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
-        description="what it is called; how far it has been served is remembered under this name",
+        description="name of the webhook; the progress of delivery is kept under it",
     )
     url: str = Field(description="where events are posted: https, or http on this computer")
     insecure: bool = Field(
@@ -23,8 +23,8 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     )
     secret_file: Path | None = Field(
         default=None,
-        description="file of mode 600 with the secret (whsec_...), relative to the settings file; of several lines, "
-        "each is signed with",
+        description="file of mode 600 with the secret (whsec_...), relative to the settings file; if it has several "
+        "lines, events are signed with each",
     )
     secret_variable: str | None = Field(
         default=None,
@@ -35,12 +35,12 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
         default=None, description="authority of the receiver's certificate (PEM), if not one of the well-known ones"
     )
     machines: tuple[str, ...] = Field(
-        default=("*/*",), min_length=1, description="only of these machines, as site/machine with * and ?"
+        default=("*/*",), min_length=1, description="only events of these machines, as site/machine with * and ?"
     )
     kinds: tuple[EventKind, ...] = Field(default=(), description="only these kinds of event; all if left out")
-    severities: tuple[Severity, ...] = Field(default=(), description="only of these severities; all if left out")
+    severities: tuple[Severity, ...] = Field(default=(), description="only events of these severities; all if left out")
     annunciated_only: bool = Field(
-        default=False, description="leave out what happens to alarms that are shelved, suppressed or out of service"
+        default=False, description="leave out events of alarms that are shelved, suppressed or out of service"
     )
     timeout_s: float = Field(
         default=10.0, ge=0.1, le=300.0, description="how long one attempt may take altogether, in seconds"

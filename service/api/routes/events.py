@@ -31,7 +31,7 @@ _LastEventId = Annotated[
         alias="Last-Event-ID",
         max_length=_LONGEST,
         json_schema_extra=_FORM,
-        description="`id` of the last event; goes on right after it",
+        description="`id` of the last event received; the stream continues after it",
     ),
 ]
 _LastEventIdArgument = Annotated[
@@ -39,19 +39,19 @@ _LastEventIdArgument = Annotated[
     Query(
         max_length=_LONGEST,
         json_schema_extra=_FORM,
-        description="the same for whoever cannot send the header, which counts if both are",
+        description="the same for clients that cannot send the header; if both are given, the header counts",
     ),
 ]
 _From = Annotated[
-    Literal["now", "beginning"], Query(alias="from", description="where to begin without the id of a last event")
+    Literal["now", "beginning"], Query(alias="from", description="where to begin if no last event is given")
 ]
 _Detail = Annotated[
     Literal["whole", "overview"],
-    Query(description="of health: all of it, or as event `overview` what an overview of many machines needs"),
+    Query(description="send health in full, or as event `overview` only what an overview of many machines needs"),
 ]
 _InFull = Annotated[
     list[str],
-    Query(max_length=64, description="of this machine whole health all the same, as site/machine; may be repeated"),
+    Query(max_length=64, description="with `overview`, this machine in full, as site/machine; may be repeated"),
 ]
 
 
@@ -85,7 +85,7 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         detail: _Detail = "whole",
         in_full: _InFull = [],  # noqa: B006
     ) -> StreamingResponse:
-        """Alarm events out of the history, each once and in the order of its machine's log, and changes of health."""
+        """Alarm events from the history, each once and in the order of its machine's log, and changes of health."""
         if service.feed.closed:
             raise HTTPException(503, "the service is being stopped")
         logs = _logs(service, machine)

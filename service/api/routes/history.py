@@ -51,9 +51,9 @@ _QUANTITIES = ("parameter", "equation", "level", *MEASURES)
 
 _After = Annotated[
     int | None,
-    Query(ge=-1, le=_LARGEST, description="only events with a greater sequence, oldest first; -1 for all there are"),
+    Query(ge=-1, le=_LARGEST, description="only greater sequences (readings: numbers), oldest first; -1 for all"),
 ]
-_Before = Annotated[int | None, Query(ge=0, le=_LARGEST, description="`next_before` of the answer before")]
+_Before = Annotated[int | None, Query(ge=0, le=_LARGEST, description="`next_before` of the previous answer")]
 
 
 def _known_quantity(name: str) -> str:
@@ -65,20 +65,20 @@ def _known_quantity(name: str) -> str:
 _Quantity = Annotated[
     str,
     AfterValidator(_known_quantity),
-    Query(description="what the windows are read for", json_schema_extra={"enum": list(_QUANTITIES)}),
+    Query(description="quantity read in each window", json_schema_extra={"enum": list(_QUANTITIES)}),
 ]
 _ReadingName = Annotated[str, Query(pattern=form("^[A-Za-z0-9_.:-]{1,80}$", "letters, digits and _ . : -, at most 80"))]
 _Names = Annotated[
     list[_ReadingName],
     Query(
         max_length=64,
-        description="which parameter, equation or level (CHANNEL:MEASURE); may be given several times with `points`, "
-        "where all is the default. Not needed for the measures of a window",
+        description="which parameter, equation or level (CHANNEL:MEASURE); with `points` it may be repeated, and all "
+        "is the default. Not needed for measures of a window",
     ),
 ]
 _Points = Annotated[
     int | None,
-    Query(ge=1, le=5000, description="reduce each to at most so many buckets of equal length, instead of one by one"),
+    Query(ge=1, le=5000, description="reduce each to at most this many equal buckets instead of single readings"),
 ]
 _OF = form(
     rf"^{_PLACE}/{_PLACE}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$",
@@ -104,7 +104,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         severity: Annotated[Severity | None, Query(description="only of this severity")] = None,
         limit: Limit = 100,
     ) -> Response:
-        """What happened to alarms, as CloudEvents: newest first, or with `after` oldest first, as followers want it."""
+        """Alarm events as CloudEvents: newest first, or with `after` oldest first, as followers need them."""
         _check_logged(view, name)
         found = view.history.events(
             after=after,
@@ -130,12 +130,12 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def evidence(
         site: SiteName,
         machine: MachineName,
-        name: Annotated[AlarmName, Path(description="of the alarm", examples=["k_by"])],
+        name: Annotated[AlarmName, Path(description="name of the alarm", examples=["k_by"])],
         occurrence: Annotated[
-            int | None, Query(ge=1, le=_LARGEST, description="which time its condition began; left out, the latest")
+            int | None, Query(ge=1, le=_LARGEST, description="which occurrence; the latest if left out")
         ] = None,
     ) -> Response:
-        """What an alarm rests on: report and pictures of before it, when it was raised, and after the change."""
+        """Evidence of an alarm: report and pictures from before it, when it was raised, and after the change."""
         view = found_machine(service, site, machine)
         text = view.history.evidence(name, occurrence)
         if text is None:
@@ -148,7 +148,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def reports(
         view: InPath, before: _Before = None, since_ns: SinceNs = None, until_ns: UntilNs = None, limit: Limit = 100
     ) -> Response:
-        """Window reports, the latest to arrive first; since_ns and until_ns are about the window's end."""
+        """Window reports, the latest to arrive first; since_ns and until_ns refer to the end of the window."""
         found = view.history.reports(since_ns=since_ns, until_ns=until_ns, before=before, limit=limit)
         return _listed(
             "reports", [one.text for _, one in found], next_before=found[-1][0] if len(found) == limit else None
@@ -165,7 +165,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         after: _After = None,
         limit: Limit = 1000,
     ) -> ReadingList | Response:
-        """Parameters, residuals and measures over time: one by one, or with `points` for a plot of any length."""
+        """Readings and measures over time: one by one, or with `points` reduced for a plot of any length."""
         history = view.history
         names = name or [quantity] if quantity in MEASURES else name
         _check_read(view, quantity, names, "name")
@@ -190,9 +190,9 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def trends(
         of: Annotated[list[_Of], Query(min_length=1, max_length=64, description="site/machine/quantity/name")],
         hours: Annotated[int, Query(ge=1, le=87_600, description="up to the end of the machine's newest window")] = 24,
-        points: Annotated[int, Query(ge=1, le=500, description="at most so many buckets for each")] = 48,
+        points: Annotated[int, Query(ge=1, le=500, description="at most this many buckets for each")] = 48,
     ) -> TrendList:
-        """What was read lately of many machines at once, for an overview of the plant."""
+        """Recent readings of many machines at once, for an overview of the plant."""
         return TrendList(trends=tuple(_trend(service, each, hours, points) for each in of))
 
     @app.get(
@@ -201,17 +201,17 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def audit(
         before: _Before = None,
         machine: Annotated[_Plain, Query(description="only about this machine, as site/machine")] = None,
-        actor: Annotated[_Plain, Query(description="only by whom has a token of this name")] = None,
+        actor: Annotated[_Plain, Query(description="only requests with a token of this name")] = None,
         limit: Limit = 100,
     ) -> AuditList:
-        """Who asked for what and what came of it, newest first; kept for ever."""
+        """Who requested what, and the outcome, newest first; kept for ever."""
         found = service.store.audit.entries(before, limit, machine=machine, actor=actor)
         _check_audited(service, machine, found)
         return AuditList(entries=found, next_before=found[-1].number if len(found) == limit else None)
 
     @app.get("/api/v1/history", tags=["service"], dependencies=[guard.configure], responses=responses(HistoryStatus))
     def history() -> HistoryStatus:
-        """How large the history is, how far back it goes, and for how long things are kept."""
+        """How large the history is, how far back it goes, and how long records are kept."""
         return service.store.status()
 
 

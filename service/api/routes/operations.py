@@ -51,8 +51,8 @@ _STATUS: dict[type[RotorwatchError], int] = {
     NotInTime: 503,
 }
 _TEXTS: dict[OperationKind, str] = {
-    "acknowledge": "Say that an alarm has been seen.",
-    "reset": "Let a latched alarm go, once its condition has cleared.",
+    "acknowledge": "State that an alarm has been seen.",
+    "reset": "Release a latched alarm, once its condition has cleared.",
     "shelve": "Silence an alarm for a time, at most as long as the machine file allows.",
     "unshelve": "End the shelving of an alarm.",
     "remove-from-service": "Take an alarm out of service, until it is returned.",
@@ -67,7 +67,7 @@ _IfMatch = Annotated[
     Header(
         alias="If-Match",
         pattern=_IF_MATCH,
-        description="ETag of the alarm as you saw it, or * for however it is; needed without `expected_state`",
+        description="ETag of the alarm as you saw it, or * for any state; needed without `expected_state`",
         examples=['"17"'],
     ),
 ]
@@ -87,11 +87,11 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     def alarms(
         view: InPath,
         state: Annotated[list[AlarmState], Query(description="only in this state; may be repeated")] = [],  # noqa: B006  # never changed
-        name: Annotated[list[AlarmName], Query(description="only this one; may be repeated")] = [],  # noqa: B006
+        name: Annotated[list[AlarmName], Query(description="only this alarm; may be repeated")] = [],  # noqa: B006
         raised: Annotated[bool, Query(description="only those that are raised")] = False,
-        all_: Annotated[bool, Query(alias="all", description="normal ones as well")] = False,
+        all_: Annotated[bool, Query(alias="all", description="include normal alarms")] = False,
     ) -> AlarmStates:
-        """Alarms that are not normal, or those that are asked for."""
+        """Alarms that are not normal, or those requested."""
         for one in name:
             check_alarm(view, one, 422)
         states = view.alarms(include_normal=all_ or bool(state or name))
@@ -119,7 +119,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         name=kind,
         operation_id=kind.replace("-", "_"),
         summary=kind.replace("-", " ").capitalize(),
-        description=f"{_TEXTS[kind]} It is done only if the alarm still is as the caller saw it.",
+        description=f"{_TEXTS[kind]} It is done only if the alarm is still as the caller saw it.",
         responses=responses(OperationDone, 400, 404, 409, 413, 415, 422, 428, headers=_ETAG),
     )
     def operate(

@@ -65,7 +65,7 @@ def add_page_routes(app: FastAPI) -> None:
     @app.get(PAGE_FILES + "{version}/{name:path}", include_in_schema=False)
     def page_file(
         version: Annotated[str, InPath(description="digest of all files")],
-        name: Annotated[str, InPath(description="of the file")],
+        name: Annotated[str, InPath(description="name of the file")],
     ) -> Response:
         if version != digest or name not in found:
             raise HTTPException(404, f"the page has no file {name[:80]} in this version; reload /")
@@ -83,6 +83,6 @@ def add_docs_routes(app: FastAPI, guard: Guard) -> None:
 
     @app.get("/docs/{name}", dependencies=[guard.read], include_in_schema=False)
     def docs_asset(
-        name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], InPath(description="of the file")],
+        name: Annotated[Literal["swagger-ui-bundle.js", "swagger-ui.css"], InPath(description="name of the file")],
     ) -> FileResponse:
         return FileResponse(_ASSETS / name, headers={"Cache-Control": "private, max-age=86400"})

@@ -38,16 +38,16 @@ _NO_ANGLE = "the shaft angle is not measured (keyphasor), and without it vibrati
 _NONE: list[str] = []
 
 _Channels = Annotated[
-    list[str], Query(alias="channel", max_length=64, description="by name; may be repeated; all displacements without")
+    list[str], Query(alias="channel", max_length=64, description="name; may be repeated; all displacements if left out")
 ]
 _Order = Annotated[int, Query(ge=1, le=3, description="multiple of running speed; the history has phases of 1 and 2")]
 _EachRevolutions = Annotated[
     int,
-    Query(ge=1, le=1000, description="that each vector of a recording is of; windows of the history are as they are"),
+    Query(ge=1, le=1000, description="revolutions per vector of a recording; the history has one vector per window"),
 ]
 _SlowRoll = Annotated[
     float | None,
-    Query(gt=0, le=1e6, description="rpm up to which the mean vector of a recording is taken away, as run-out"),
+    Query(gt=0, le=1e6, description="rpm up to which the mean vector of a recording is subtracted as run-out"),
 ]
 _Values = TypeVar("_Values", WaveformSnapshot, FullSpectrumSnapshot, WaterfallSnapshot, VectorSeries, CentrelineSeries)
 
@@ -104,7 +104,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
 
     @app.get(f"{PLACE}/full-spectra", responses=responses(FullSpectrumSnapshot, 404, 422), **common)
     def full_spectra(view: InPath, chosen: ChosenWindow) -> FullSpectrumSnapshot:
-        """Full spectra of the newest seconds: forward precession and reverse, at each place with two displacements."""
+        """Full spectra of the newest seconds: forward and reverse precession at each place with two displacements."""
         return _made(reader, view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
 
     @app.get(f"{PLACE}/waterfalls", responses=responses(WaterfallSnapshot, 404, 422), **common)
@@ -112,9 +112,9 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         view: InPath,
         chosen: ChosenSamples,
         channel: Annotated[
-            str | None, Query(max_length=64, description="by name; the first that vibrates without")
+            str | None, Query(max_length=64, description="name of the channel; the first vibration channel if left out")
         ] = None,
-        over: Annotated[Literal["time", "speed"], Query(description="what the rows go over")] = "time",
+        over: Annotated[Literal["time", "speed"], Query(description="rows by time or by speed")] = "time",
     ) -> WaterfallSnapshot:
         """Spectra of one channel, one after the other, over time or speed."""
         shown = chosen_channels(view.machine, [] if channel is None else [channel])
@@ -154,6 +154,6 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
     def centrelines(
         view: InPath, since_ns: SinceNs = None, until_ns: UntilNs = None, recording: Recordings = _NONE
     ) -> CentrelineSeries:
-        """Where the shaft was on average, over time and speed, from the history or recordings."""
+        """Average position of the shaft over time and speed, from the history or recordings."""
         chosen = Chosen(tuple(recording), None, since_ns, until_ns)
         return _made(reader, view, chosen, CentrelineSeries, centreline_series, of_history=True)

@@ -27,11 +27,11 @@ _NONE = "no recordings: the settings name no directory for them ([recording] dir
 
 _Site = Annotated[str | None, Query(description="only of this site")]
 _Machine = Annotated[str | None, Query(description="only of this machine, its name or site/machine")]
-_SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this time, ns since 1970-01-01 UTC")]
-_UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
-_Latest = Annotated[int | None, Query(ge=1, le=10_000, description="at most so many of each machine, the latest")]
+_SinceNs = Annotated[int | None, Query(ge=0, description="only those that reach this time, ns since 1970-01-01 UTC")]
+_UntilNs = Annotated[int | None, Query(ge=0, description="only those that begin before this time")]
+_Latest = Annotated[int | None, Query(ge=1, le=10_000, description="at most this many of each machine, the latest")]
 _DataTimes = Annotated[
-    bool, Query(description="say of which data they are, too, which takes a look into each the first time")
+    bool, Query(description="also give the times of the data; for this, each recording must be opened the first time")
 ]
 
 
@@ -90,12 +90,12 @@ def add_recording_routes(
         response_class=FileResponse,
         responses={
             200: {"content": {"application/octet-stream": {}}},
-            206: {"description": "The ranges asked for", "content": {"application/octet-stream": {}}},
+            206: {"description": "The requested ranges", "content": {"application/octet-stream": {}}},
             **problem_responses(400, 404, 409, 416, 422),
         },
     )
     def download_recording(site: str, machine: str, name: str) -> FileResponse:
-        """The file itself; ranges may be asked for."""
+        """Download the file, or ranges of it."""
         found = found_recording(index, f"{site}/{machine}/{name}")
         if not found.complete:
             raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")

@@ -54,7 +54,7 @@ _UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # addres
 
 
 class NoOrder(Record):
-    """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
+    """An empty object; sending it as JSON shows that the request is not from another site's page."""
 
 
 class ReplayRequests:
@@ -236,8 +236,8 @@ def add_replay_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
 
 
 NothingToSay = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
-_Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
-_Every = Annotated[int, Query(ge=1, le=100_000, description="of those that are left only every so many-th, for a plot")]
+_Offset = Annotated[int, Query(ge=0, description="leave out this many, the oldest")]
+_Every = Annotated[int, Query(ge=1, le=100_000, description="of the rest, only every n-th, for a plot")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
@@ -251,18 +251,18 @@ def _add_reading_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> Non
 
     @app.get(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def replay(replay_id: str) -> ReplayJob:
-        """How far a replay is, and in the end what it found."""
+        """Progress of a replay, and at the end its results."""
         return desk.found(replay_id).view
 
     @app.get(f"{_JOB}/reports", responses=responses(ReplayReportList, 404, 422), **common)
     def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100, every: _Every = 1) -> ReplayReportList:
-        """Window reports of an offline replay; the history of the live machine has none of them."""
+        """Window reports of an offline replay; they are not in the history of the live machine."""
         found, following = _results(desk, replay_id, "/report", offset, limit, every)
         return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
 
     @app.get(f"{_JOB}/alarms", responses=responses(ReplayAlarmList, 404, 422), **common)
     def replay_alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
-        """Alarm events of an offline replay; nobody else hears of them."""
+        """Alarm events of an offline replay; they are not sent to anybody else."""
         found, following = _results(desk, replay_id, "/alarm/event", offset, limit)
         events = tuple(AlarmCloudEvent.model_validate_json(one) for one in found)
         return ReplayAlarmList(events=events, next_offset=following)
@@ -297,7 +297,7 @@ def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> No
 
     @app.delete(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def stop_replay(replay_id: str) -> ReplayJob:
-        """Stop a replay; what it found so far stays."""
+        """Stop a replay; its results so far are kept."""
         found = desk.found(replay_id)
         found.end()
         return found.view
@@ -310,7 +310,7 @@ def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> No
 
     @app.post(f"{_JOB}/resume", responses=responses(ReplayJob, *problems, 409), **common)
     def resume_replay(replay_id: str, order: NothingToSay) -> ReplayJob:
-        """Let a paused replay go on."""
+        """Resume a paused replay."""
         _ = order
         return _order(desk, replay_id, "resume")
 
@@ -318,7 +318,7 @@ def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> No
     def seek_in_replay(
         replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
     ) -> ReplayJob:
-        """Let a paced replay go on elsewhere; a monitor ignores what it has heard already."""
+        """Continue a paced replay from another position; a monitor ignores data that it has already received."""
         return _order(desk, replay_id, f"seek {place.to_ns if place.by_s is None else f'{place.by_s:+f}'}")
 
 

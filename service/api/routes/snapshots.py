@@ -29,10 +29,10 @@ _NONE: list[str] = []
 _First = Annotated[list[str], Query(max_length=64, description="channel i of a pair, by name; may be repeated")]
 _Second = Annotated[
     list[str],
-    Query(max_length=64, description="channel j of each pair, as many as of `first`; left out, each with itself"),
+    Query(max_length=64, description="channel j of each pair, as many as `first`; each with itself if left out"),
 ]
-_Channels = Annotated[list[str], Query(alias="channel", max_length=64, description="by name; may be repeated")]
-_Units = Annotated[Units, Query(description="of the values: the channels' own, or SI")]
+_Channels = Annotated[list[str], Query(alias="channel", max_length=64, description="name; may be repeated")]
+_Units = Annotated[Units, Query(description="units of the values, the channels' own or SI")]
 _Revolutions = Annotated[
     int, Query(ge=0, le=MOST_REVOLUTIONS, description="newest revolutions to show sample by sample as well")
 ]
@@ -97,7 +97,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
     def correlations(
         view: InPath, chosen: ChosenWindow, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
     ) -> Response:
-        """Correlation functions of the latest window, or one that was recorded, and theory; a few pairs by default."""
+        """Correlation functions of the latest or a recorded window, with theory; a few pairs by default."""
         shown, data = reader.window(view, chosen)
         asked = ("correlations", view, chosen, tuple(first), tuple(second), units)
         return answers.of(asked, data, lambda: shown.correlations(data, first, second, units))
@@ -113,7 +113,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
         to_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies up to here")] = None,
         units: _Units = "channel",
     ) -> Response:
-        """Power spectral densities of the latest window, or one that was recorded, cross-spectra, and theory."""
+        """Power spectral densities and cross-spectra of the latest or a recorded window, with theory."""
         band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
@@ -125,7 +125,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
     def orbits(
         view: InPath, chosen: ChosenWindow, revolutions: _Revolutions = 0, units: _Units = "channel"
     ) -> Response:
-        """Orbits at running speed of the latest window, or one that was recorded, and revolutions as measured."""
+        """Orbits at running speed of the latest or a recorded window, and revolutions as measured."""
         shown, data = reader.window(view, chosen)
         asked = ("orbits", view, chosen, revolutions, units)
         return answers.of(asked, data, lambda: shown.orbits(data, revolutions, units), of_samples=revolutions > 0)

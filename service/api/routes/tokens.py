@@ -32,7 +32,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
 
     @app.get(_PLACE, tags=["service"], dependencies=[guard.configure], responses=responses(TokenList))
     def tokens() -> TokenList:
-        """Every token ever created, without its secret; an application in the open says that none is needed."""
+        """Every token ever created, without its secret, and whether tokens are needed."""
         found = tuple(_entry(guard, record) for record in guard.tokens.all())
         return TokenList(needed=not guard.access.open_on_loopback, tokens=found)
 
@@ -47,7 +47,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
         caller: Annotated[Caller, guard.configure],
         wish: Annotated[TokenRequest, Body(openapi_examples=_SHOWN)],
     ) -> TokenCreated:
-        """Create a token; its text is in the answer, this once, and only a hash of it is kept."""
+        """Create a token; only this answer shows its text, because only a hash of it is kept."""
         scopes = frozenset(Scope(one) for one in wish.scopes)
         said = f"{wish.name}, {' '.join(one for one in Scope if one in scopes)}"
         request.state.audit = AuditNote("create-token", reason=said)
@@ -76,7 +76,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
         f"{_PLACE}/{{token_id}}", tags=["service"], dependencies=[guard.configure], responses=responses(TokenEntry, 404)
     )
     def revoke_token(request: Request, token_id: _ID) -> TokenEntry:
-        """Revoke a token: it is refused from the next request on; one that is revoked already stays as it is."""
+        """Revoke a token: it is refused from the next request on; a token revoked before stays as it is."""
         request.state.audit = AuditNote("revoke-token", reason=token_id)
         guard.tokens.revoke(token_id, time.time_ns())
         record = guard.tokens.find(token_id)
@@ -112,7 +112,7 @@ def add_session_routes(app: FastAPI, guard: Guard) -> None:
 
     @app.get("/api/v1/caller", responses=responses(CallerRights), **common)
     def caller(request: Request, caller: Annotated[Caller, guard.read]) -> CallerRights:
-        """Who calls, and which scopes that caller has; as a password a token lets its owner look and no more."""
+        """Name and scopes of the caller; a token given as a password has only the scope read."""
         looks = "authorization" in request.headers and presented_text(request.headers, "POST") is None
         return _rights(caller.name, frozenset({Scope.READ}) if looks else caller.scopes)
 
@@ -120,7 +120,7 @@ def add_session_routes(app: FastAPI, guard: Guard) -> None:
     def sign_in(
         request: Request, answer: Response, caller: Annotated[Caller, guard.read], order: NothingToSay
     ) -> CallerRights:
-        """Let a browser keep the token that this request is made with, until it is closed or signs out."""
+        """Let a browser keep the token of this request until it is closed or signs out."""
         _ = order
         token = presented_text(request.headers, request.method)
         if token:
