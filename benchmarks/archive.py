@@ -96,7 +96,7 @@ def evaluated(tasks: Sequence[MachineTask], workers: int) -> tuple[float, float,
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="an archive on two Ray workers against one")
+    parser = argparse.ArgumentParser(description="speed of evaluating an archive on two Ray workers and on one")
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--machines", type=int, default=4)
     asked = parser.parse_args()

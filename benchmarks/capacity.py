@@ -316,14 +316,14 @@ def _untold(plant: Plant) -> int:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="how many machines one monitor carries")
+    parser = argparse.ArgumentParser(description="how many machines one monitor can watch")
     parser.add_argument("--machines", type=int, nargs="+", default=[10, 20, 40])
-    parser.add_argument("--seconds", type=float, default=120.0, help="that are measured, after the windows are full")
+    parser.add_argument("--seconds", type=float, default=120.0, help="seconds measured after the windows are full")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--channels", type=int, default=9)
     parser.add_argument("--rate", type=float, default=2000.0, help="samples per second and channel")
     parser.add_argument("--hop", type=float, default=5.0, help="seconds between reports")
-    parser.add_argument("--levels", action="store_true", help="nothing is known of the machines but their channels")
+    parser.add_argument("--levels", action="store_true", help="machines of which only the channels are known")
     parser.add_argument("--no-networks", action="store_true", help="rotor kits without trained networks")
     parser.add_argument("--stall", type=float, default=0.0, help="seconds for which the monitor is stopped")
     parser.add_argument("--of-shard", action="store_true", help="stop one of the processes that share the machines")

@@ -86,11 +86,13 @@ def written(heading: dict[str, Any], recording: dict[str, Any], cases: list[dict
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description="what a machine takes, for rotorwatch size")
-    parser.add_argument("--machines", type=int, default=10, help="of each kind; from thirty on processes share them")
-    parser.add_argument("--seconds", type=float, default=30.0, help="that are measured of each kind")
+    parser = argparse.ArgumentParser(description="resources that a machine needs, for rotorwatch size")
+    parser.add_argument(
+        "--machines", type=int, default=10, help="machines of each kind; from thirty on, processes share them"
+    )
+    parser.add_argument("--seconds", type=float, default=30.0, help="seconds measured for each kind")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", type=int, nargs="+", help="only these, from 1")
+    parser.add_argument("--cases", type=int, nargs="+", help="only these cases, numbered from 1")
     parser.add_argument("--out", type=Path, default=FILE)
     asked = parser.parse_args()
     former: dict[str, Any] = read_toml(FILE)

@@ -143,9 +143,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="bytes written to the disk per hop and machine")
     parser.add_argument("--machines", type=int, default=1)
-    parser.add_argument("--hops", type=int, default=600, help="of each machine")
+    parser.add_argument("--hops", type=int, default=600, help="hops of each machine")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--days", type=float, default=30.0, help="of buckets that are there before")
+    parser.add_argument("--days", type=float, default=30.0, help="days of buckets already in the history")
     parser.add_argument("--together", action="store_true", help="machines complete their hops at the same time")
     asked = parser.parse_args()
     configure_logging(LogSettings(level="error"))

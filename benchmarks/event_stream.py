@@ -1,4 +1,4 @@
-"""What the event stream of a plant costs: bytes, and the processor without HTTP around it.
+"""Measures what the event stream of a plant costs: bytes, and processor time without HTTP.
 
 Run: ``python benchmarks/event_stream.py HEALTH`` (a minute) with the answer of ``GET …/health`` in a file. 500 machines
 publish such a health every 5 s, in batches of 25 four times per second, to various numbers of listeners.

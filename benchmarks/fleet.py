@@ -171,7 +171,7 @@ def main() -> None:
     parser.add_argument("--machines", type=int, default=60)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--database", required=True, help="PostgreSQL; what it holds is dropped")
+    parser.add_argument("--database", required=True, help="PostgreSQL database; its contents are dropped")
     asked = parser.parse_args()
     logs = {}
     length_s = WARM_S + (2 * asked.kills + 2) * BETWEEN_S  # twice, for a busy computer

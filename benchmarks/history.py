@@ -164,7 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="a monitor with a long history")
     parser.add_argument("--reports", type=int, default=1_000_000)
     parser.add_argument("--machines", type=int, default=20)
-    parser.add_argument("--file", type=Path, help="history to take, or to make if it is not there")
+    parser.add_argument("--file", type=Path, help="history to use, made if it does not exist")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)

@@ -1,4 +1,4 @@
-"""What slow, silent and too many HTTP callers do to a monitor that is at work, and how soon it is over.
+"""Attacks a working monitor with slow, silent and too many HTTP callers; measures the effect and the time to recover.
 
 Run: ``python benchmarks/http_campaign.py`` (about twenty minutes), ``--small`` for half a minute. For each number of
 files that the monitor may open (256 and 1024), a monitor is started on loopback, a simulated rotor kit sends to it at
@@ -177,8 +177,8 @@ def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit:
 def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--small", action="store_true", help="some dozens of callers, for seconds")
-    parser.add_argument("--files", type=int, nargs="+", help="how many the monitor may open (256 1024)")
+    parser.add_argument("--small", action="store_true", help="some dozens of callers for some seconds")
+    parser.add_argument("--files", type=int, nargs="+", help="how many files the monitor may open (256 1024)")
     parser.add_argument("--seconds", type=float, help="how long each attack lasts (70; small: 1.2)")
     options = parser.parse_args()
     small = options.small

@@ -1,4 +1,4 @@
-"""What the page costs: a browser with a plant of many machines, and a monitor with many pages.
+"""Measures what the page costs: in a browser with a plant of many machines, and in a monitor with many pages.
 
 Run: ``python benchmarks/page.py`` (about eight minutes, with a Chromium, or the one in ``ROTORWATCH_CHROMIUM``),
 ``--small`` for three.
@@ -178,7 +178,7 @@ def pages(one: Monitor, paths: list[str], count: int, seconds: float) -> tuple[f
 def main() -> None:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--small", action="store_true", help="fewer machines and pages, for seconds")
+    parser.add_argument("--small", action="store_true", help="fewer machines and pages for some seconds")
     small = parser.parse_args().small
     with chromium() as browser:
         print(

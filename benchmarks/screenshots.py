@@ -1,4 +1,4 @@
-"""Pictures of the page for the documents: a real monitor, three simulated rotors, one of which loses bearing stiffness.
+"""Takes the documents' pictures of the page: a real monitor of three simulated rotors, one losing bearing stiffness.
 
 Run: ``python benchmarks/screenshots.py [FOLDER]`` (two minutes, with a Chromium, or the one in ``ROTORWATCH_CHROMIUM``;
 FOLDER is ``docs/figures`` by default).

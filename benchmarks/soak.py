@@ -1,4 +1,4 @@
-"""A day of a machine's life through the real service, with all that goes wrong, against the same day offline.
+"""Runs a day of a machine, with all that can go wrong, through the real service, and compares it with an offline run.
 
 Run: ``python benchmarks/soak.py --hours 24 --seed 1`` (hours of data). A simulated rotor kit changes its parameters at
 times; probes get stuck; blocks are lost, repeated and swapped; the monitor is killed (SIGKILL) at work and restarted;
@@ -263,8 +263,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kills", type=float, default=40.0, help="of the monitor, about, in the first two thirds")
-    parser.add_argument("--keep", type=Path, help="empty folder for everything that is written; thrown away without it")
+    parser.add_argument(
+        "--kills", type=float, default=40.0, help="approximate number of kills of the monitor, in the first two thirds"
+    )
+    parser.add_argument("--keep", type=Path, help="empty folder in which all output is kept; deleted without it")
     parser.add_argument("--offline", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--follow", help=argparse.SUPPRESS)
     parser.add_argument("--into", type=Path, help=argparse.SUPPRESS)

@@ -1,4 +1,4 @@
-"""Ten thousand bad messages a second, of one kind after the other, and what they cost the blocks of a machine.
+"""Floods a monitor with ten thousand bad messages a second, kind after kind; measures the effect on a machine's blocks.
 
 Run: ``python benchmarks/wire_flood.py`` (about five minutes). A monitor is started on loopback, and a simulated rotor
 kit sends to it at pace 1, while another program on the same computer sends to the same keys at the given rate, without
@@ -131,8 +131,8 @@ def flood(one: Monitor, kind: str, rate: float, seconds: float) -> list[str]:
 def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--rate", type=float, default=10_000.0, help="messages a second")
-    parser.add_argument("--seconds", type=float, default=15.0, help="for which each kind comes")
+    parser.add_argument("--rate", type=float, default=10_000.0, help="messages per second")
+    parser.add_argument("--seconds", type=float, default=15.0, help="seconds for which each kind is sent")
     parser.add_argument("--kinds", nargs="+", choices=FLOODS, default=FLOODS)
     parser.add_argument("--send", choices=FLOODS, help=argparse.SUPPRESS)
     parser.add_argument("--endpoint", help=argparse.SUPPRESS)

@@ -1,4 +1,4 @@
-"""A million messages that no machine sends, against a monitor that is at work.
+"""Sends a million messages that no machine would send to a working monitor.
 
 Run: ``python benchmarks/wire_fuzz.py`` (about half an hour), ``--small`` for some seconds.
 ``wire_flood.py`` sends many bad messages of one kind per second instead.
@@ -267,7 +267,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="number of the first message, to repeat a part of a run")
     parser.add_argument("--small", action="store_true", help="a few thousand messages")
-    parser.add_argument("--json", type=Path, default=Path("wire_fuzz.json"), help="where the result goes")
+    parser.add_argument("--json", type=Path, default=Path("wire_fuzz.json"), help="file for the result")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="wire-fuzz-"))
     others = [folder / f"{place.partition('/')[2]}.toml" for place in (_SECOND, _THIRD)]

@@ -43,7 +43,7 @@ _ScenarioArgument = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Shipped scenario by name, or the path of a scenario file.")
 ]
 _MachineOption = Annotated[
-    str | None, typer.Option("--machine", help="Another machine than the scenario's: shipped name, or path.")
+    str | None, typer.Option("--machine", help="Machine to use instead of the scenario's: shipped name, or path.")
 ]
 _SeedOption = Annotated[int | None, typer.Option(min=0, help="Seed of all random forces and noise.")]
 _DurationOption = Annotated[float | None, typer.Option("--duration", help="Data seconds; the scenario's if left out.")]
@@ -77,7 +77,7 @@ def publish(
     pace: Annotated[
         str,
         typer.Option(
-            help="Data seconds per second: 1 is real time, 20 is twenty times faster, max is back-pressure only."
+            help="Data seconds per second: 1 is real time, 20 twenty times faster, max limited by back-pressure only."
         ),
     ] = "1",
     block_s: _BlockOption = 0.1,
@@ -170,7 +170,7 @@ def record(
     run: Annotated[int, typer.Option(min=0, max=65535, help="Run number.")] = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
 ) -> None:
-    """Write the same stream into a recording, at full speed.
+    """Write the stream of a simulated machine into a recording, at full speed.
 
     [bold]Examples[/bold]
 

@@ -80,8 +80,8 @@ def calibrate(
 ) -> None:
     """Calibrate the networks of a bundle anew, on simulated windows; they are not trained again.
 
-    For a bundle that an earlier version made: what its networks read and how sure they say to be is compared with what
-    is true in some three thousand windows.
+    For a bundle made by an earlier version: the readings of its networks and their stated errors are compared with the
+    truth in some three thousand windows.
 
     Example: rotortrain calibrate --machine lab --bundle lab-bundle --out lab-bundle
     """
@@ -127,7 +127,7 @@ def commission(
     ] = None,
     why: Annotated[str, typer.Option(help="Why the machine is commissioned again; kept in the bundle.")] = "",
     networks: Annotated[
-        bool, typer.Option(help="Train the networks, too, where the parameters are known (a quarter of an hour).")
+        bool, typer.Option(help="Also train the networks, if the parameters are known (a quarter of an hour).")
     ] = True,
     windows: WindowsOption = _WINDOWS,
     draws: DrawsOption = _DRAWS,
@@ -138,8 +138,8 @@ def commission(
 
     With all parameters in the machine file (level full) the recordings are checked against theory and the networks
     trained. With masses and shaft alone (partial) stiffness, damping and unbalance are identified. With nothing but
-    channels and sampling (none) the relations between bearing and disc are learned, and changes are told relative to
-    them. The report says what can be read, how sharply, and what to record where it is not enough. Recordings that are
+    channels and sampling (none) the relations between bearing and disc are learned, and changes are relative to them.
+    The report states what can be read, how precisely, and what to record if that is not enough. Recordings that are
     too short, not steady or faulty are refused (exit code 3).
 
     Example: rotortrain commission --machine pump.toml --healthy monday.mcap --healthy friday.mcap --out pump-bundle

@@ -30,7 +30,7 @@ _WITH_RAMP = ("offset", "gain", "noise_relative")
 
 
 class NamedSource(Source, extra="forbid", frozen=True, allow_inf_nan=False):
-    """An independent source of coloured force with a name that events refer to."""
+    """An independent source of coloured force, with a name for events to refer to."""
 
     name: str = Field(min_length=1, max_length=64, description="unique name, as events refer to it")
 
@@ -50,7 +50,7 @@ class SensorSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False
 
 
 class ChannelSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
-    """Settings of one channel; those left out are as for all channels."""
+    """Settings of one channel; those left out are taken from the settings of all channels."""
 
     noise_relative: float | None = Field(default=None, ge=0, le=100)
     noise_corner_hz: float | None = Field(default=None, gt=0, le=1e6)
@@ -78,7 +78,7 @@ class Sensors(SensorSettings):
 class Rub(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where the disc may touch the casing; the contact's stiffness is the size of the event that starts the rub."""
 
-    clearance_m: float = Field(gt=0, le=0.1, description="radial, around the disc's place at rest")
+    clearance_m: float = Field(gt=0, le=0.1, description="radial clearance around the disc's position at rest")
     friction: float = Field(default=0.1, ge=0, le=1, description="sliding friction coefficient")
 
 
@@ -191,10 +191,10 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
 class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """A machine, its excitation, the errors of its sensors, and what happens when."""
 
-    name: str = Field(default="scenario", description="shown in truth records; the file's name if left out")
+    name: str = Field(default="scenario", description="name shown in truth records; the file's name if left out")
     description: str = ""
     machine: str = Field(min_length=1, description="shipped machine, or path of a machine file beside the scenario")
-    seed: int = Field(ge=0, description="of all random numbers; the same seed gives the same samples")
+    seed: int = Field(ge=0, description="seed of all random numbers; the same seed gives the same samples")
     duration_s: float = Field(gt=0, le=1e8, description="data seconds from first to last sample")
     sources: tuple[NamedSource, ...] = Field(default=(), max_length=16)
     sensors: Sensors = Sensors()

@@ -24,24 +24,24 @@ from simulator.timeline import Condition, compile_timeline
 
 
 class TruthRecord(BaseModel, extra="forbid", frozen=True):
-    """The true condition from one time on; sent at the start, at every change, and every second during a ramp."""
+    """True condition from a given time on; sent at the start, at every change, and every second during a ramp."""
 
-    time_ns: int = Field(description="acquisition time of the first sample this is true for, ns since 1970 UTC")
-    data_s: float = Field(description="the same, seconds from the first sample")
+    time_ns: int = Field(description="acquisition time of the first sample for which this is true, ns since 1970 UTC")
+    data_s: float = Field(description="the same time in seconds from the first sample")
     run: int
     machine: str
     scenario: str
     seed: int
-    relative_changes: dict[str, float] = Field(description="every parameter's change from the original machine")
+    relative_changes: dict[str, float] = Field(description="change of every parameter from the original machine")
     speed_rpm: float
     sources: tuple[NamedSource, ...]
     excitation_level: float = Field(default=1.0, description="factor on the white noise that drives all sources")
     anomalies: dict[str, float] = Field(default={}, description="size of a crack, a rub, added mass; absent if none")
     sensor_faults: dict[str, dict[str, float | None]] = Field(
-        description="by channel the active faults and their values, null where the kind has none"
+        description="active faults and their values by channel; null if the kind has no value"
     )
     ramping: tuple[str, ...] = Field(
-        description="what is still on its way: parameters, sources, sensors, anomalies, 'speed', …"
+        description="what is still changing: parameters, sources, sensors, anomalies, 'speed', …"
     )
 
     @property

@@ -42,12 +42,12 @@ def main(
     seed: Annotated[int, typer.Option(min=0)] = 20261122,
     processes: Annotated[int, typer.Option(min=1)] = os.cpu_count() or 1,
     ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="On all cores of this Ray cluster instead.")
+        str | None, typer.Option(metavar="ADDRESS", help="Use all cores of this Ray cluster instead.")
     ] = None,
     small: Annotated[bool, typer.Option("--small", help="The smallest plan: a check, not a result.")] = False,
     docs: Annotated[Path | None, typer.Option(help="Write the pages of these studies into this folder.")] = None,
 ) -> None:
-    """Run studies on simulated windows; records are kept, and an interrupted study carries on where it stopped.
+    """Run studies on simulated windows; records are kept, and an interrupted study continues where it stopped.
 
     Example: python -m benchmarks.studies evaluate --machine lab --windows 500 --out studies --docs docs
 

@@ -291,7 +291,7 @@ def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
 class ChannelDescriptor(BaseModel, frozen=True):
     """Columns, rate and number format of one machine's stream, as served on the ``descriptor`` key.
 
-    Publishers and recordings may be of a later version: fields that are not known here are passed over.
+    Publishers and recordings may be of a later version: unknown fields are ignored.
     """
 
     site: str

@@ -43,7 +43,7 @@ def create(
     ] = None,
     config: HistoryOption = None,
 ) -> None:
-    """Create a token and show it, once: only a hash of it is kept.
+    """Create a token and show it once; only a hash of it is kept.
 
     [bold]Examples[/bold]
 
@@ -159,9 +159,9 @@ def audit(
 ) -> None:
     """Show who did what over HTTP, and who was refused; newest first, times in UTC.
 
-    One entry a line: time, status, who, from where, what, and the reason given.
-    An action whose outcome is not known was begun, and the monitor ended
-    before it could write what came of it.
+    One entry per line: time, status, caller, address, action and the reason given.
+    If the outcome of an action is not known, the monitor ended after the start
+    of the action, before it could write the outcome.
 
     [bold]Example[/bold]
 

@@ -54,7 +54,7 @@ def backup(
 
 @commands.command()
 def restore(
-    backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="From: rotorwatch history backup.")],
+    backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="Backup made by rotorwatch history backup.")],
     config: HistoryOption = None,
 ) -> None:
     """Replace the history with a backup; the monitor must be stopped. The previous file is kept.

@@ -26,7 +26,7 @@ _EXAMPLE = "DE-H acceleration g DE horizontal"
 @commands.command()
 def init(
     folder: Annotated[
-        Path, typer.Option("--folder", metavar="DIR", help="Where the two files go; created if it does not exist.")
+        Path, typer.Option("--folder", metavar="DIR", help="Folder for the two files; created if it does not exist.")
     ] = Path(),
     site: Annotated[str | None, typer.Option("--site", help="Site of the machine: a group of machines.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the machine.")] = None,
@@ -59,7 +59,7 @@ def init(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Write a machine file with nothing but sensors, and settings of a monitor for it; asks for what is left out.
+    """Write a machine file with only sensors, and monitor settings for it; asks for whatever is left out.
 
     The monitor watches vibration levels at once, and records. Diagnosis is added by [cyan]rotortrain commission[/cyan].
 
@@ -185,9 +185,9 @@ def doctor(
         ),
     ] = None,
 ) -> None:
-    """Listen to a machine's stream for a while, and say what arrives: rate, units, levels, keyphasor; what is missing.
+    """Listen to a machine's stream for a while, and report rate, units, levels and keyphasor, and what is missing.
 
-    It listens as a monitor would, on tcp/127.0.0.1:7447. Where a monitor runs already, connect to it.
+    It listens as a monitor would, on tcp/127.0.0.1:7447. If a monitor is already running, connect to it.
 
     [bold]Examples[/bold]
 

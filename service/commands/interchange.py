@@ -23,7 +23,7 @@ def import_(
         ),
     ],
     mapping: Annotated[
-        Path, typer.Option("--mapping", metavar="FILE", help="Which column is which channel, in which unit (TOML).")
+        Path, typer.Option("--mapping", metavar="FILE", help="Mapping of columns to channels and units (TOML).")
     ],
     machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file, or name of a shipped one.")],
     out: Annotated[Path, typer.Option("--out", metavar="RECORDING", help="Recording to write (.mcap).")],
@@ -31,10 +31,10 @@ def import_(
 ) -> None:
     """Turn measurements from another program into a recording.
 
-    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps. The files of a folder,
-    such as snapshots, are joined in the order of their times, which are in their names (20260131T120000), in the files,
-    or follow from the mapping's start and the machine's schedule. Files of a folder that cannot be read are left out
-    and named, with exit code 1.
+    Units, rate and time are checked, and faults are reported with row and column. Gaps stay gaps. The files of a
+    folder, such as snapshots, are joined in the order of their times, which are in their names (20260131T120000), in
+    the files, or follow from the mapping's start and the machine's schedule. Files of a folder that cannot be read are
+    left out and named, with exit code 1.
 
     Empty cells and NaN are refused, unless the mapping says time.not_finite = "missing", which keeps the other channels
     where a probe was dead, or "gap", which leaves such rows out.
@@ -71,7 +71,7 @@ def export(
         Literal["stream", "reports", "alarms"], typer.Option("--what", help="Samples, reports or alarm events.")
     ] = "stream",
     machine: Annotated[
-        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Which one, if there are several.")
+        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Machine to export, if there are several.")
     ] = None,
     from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC).")] = None,
     to_time: Annotated[
@@ -82,7 +82,7 @@ def export(
 ) -> None:
     """Write samples, reports or alarms of recordings for MATLAB, pandas, Excel and others.
 
-    Units go with the columns, times are nanoseconds since 1970 (UTC), gaps stay gaps.
+    Columns state their units, times are nanoseconds since 1970 (UTC), and gaps stay gaps.
 
     [bold]Examples[/bold]
 

@@ -23,7 +23,7 @@ _SPEEDS = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
 commands = typer.Typer(name="plot", cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
 
 _AtOption = Annotated[
-    str | None, typer.Option("--at", metavar="TIME", help="Latest data up to this time; else up to the end.")
+    str | None, typer.Option("--at", metavar="TIME", help="Use data up to this time; else up to the end.")
 ]
 _WindowOption = Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data used.")]
 _ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Line spacing.")]
@@ -45,10 +45,10 @@ _ChannelsOption = Annotated[
     ),
 ]
 _PlaceOption = Annotated[
-    str | None, typer.Option("--place", metavar="NAME", help="Where the probes are; all places if left out.")
+    str | None, typer.Option("--place", metavar="NAME", help="Place of the probes; all places if left out.")
 ]
 _OrderOption = Annotated[int, typer.Option("--order", min=1, max=3, help="Multiple of running speed: 1, 2 or 3.")]
-_EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many are averaged per point.")]
+_EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="Revolutions averaged per point.")]
 _SlowRollOption = Annotated[
     float | None,
     typer.Option("--slow-roll", metavar="RPM", help="Subtract the mean vector up to this speed (run-out)."),
@@ -57,7 +57,7 @@ _SlowRollOption = Annotated[
 
 @commands.callback()
 def _describe() -> None:
-    """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: the extra "plots".
+    """Draw recordings as PNG or SVG, by the end of the file name. Needs matplotlib (the extra "plots").
 
     Times are UTC, and those of the data, however fast they were recorded. The same input gives the same file.
 
@@ -66,7 +66,7 @@ def _describe() -> None:
     What changed, and when:
     [cyan]rotorwatch plot trend monday.mcap --out trend.png[/cyan]
 
-    What the equations' networks expected in the window that ends 170 s after the start:
+    What the equations' networks predicted for the window that ends 170 s after the start:
     [cyan]rotorwatch plot correlation monday.mcap --at 170 --out correlation.svg[/cyan]
 
     Orbits, spectra up to 100 Hz, and a run-up over the speed:
@@ -264,7 +264,7 @@ def waterfall(
     density: _DensityOption = False,
     scale: Annotated[
         Literal["log", "linear"] | None,
-        typer.Option("--scale", help="Of colours or heights; log for colours and densities."),
+        typer.Option("--scale", help="Scale of colours or heights; if left out, log for colours and densities."),
     ] = None,
     to_hz: _ToHzOption = None,
     axis: Annotated[Literal["time", "speed"], typer.Option("--axis", help="Over time, or over the speed.")] = "time",
@@ -301,7 +301,7 @@ def full_spectrum(
     place: _PlaceOption = None,
     window: _WindowOption = 20.0,
     resolution: _ResolutionOption = 0.5,
-    scale: Annotated[Literal["log", "linear"], typer.Option("--scale", help="Of amplitudes.")] = "linear",
+    scale: Annotated[Literal["log", "linear"], typer.Option("--scale", help="Scale of amplitudes.")] = "linear",
     to_hz: _ToHzOption = None,
     axis: Annotated[
         Literal["hz", "orders"], typer.Option("--axis", help="Frequencies, or multiples of running speed.")
@@ -321,7 +321,7 @@ def centreline(
     window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per mean.")] = 1.0,
     clearance: Annotated[
         float | None,
-        typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, the start at the bottom."),
+        typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, start at the bottom."),
     ] = None,
 ) -> "Paint":
     """Mean position of the shaft across the bearing, from gaps in y and z, over speed or time."""
@@ -342,7 +342,7 @@ def bode(
     speeds: Annotated[
         str | None,
         typer.Option(
-            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: where to search for the speed. No phase."
+            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: range to search for the speed. Gives no phase."
         ),
     ] = None,
 ) -> "Paint":
@@ -360,7 +360,7 @@ def polar(
     revolutions: _EachOption = 16,
     slow_roll: _SlowRollOption = None,
 ) -> "Paint":
-    """The same as vectors in their plane, with speeds at points; the lag goes against the rotation."""
+    """Amplitude and phase lag of 1x as vectors in the plane, with speeds; the lag counts against the rotation."""
     from service.analysis.figures.run_up import polar as read  # noqa: PLC0415
 
     return read(picture.known(), channel or (), order, revolutions, slow_roll)

@@ -33,7 +33,8 @@ def record(
         typer.Option("--machine", metavar="FILE", help="Machine to record: shipped name or path. Repeatable."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Where files go, in DIR/<site>/<machine>/.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder of the files, which are in DIR/<site>/<machine>/."),
     ] = None,
     config: Annotated[
         Path | None,
@@ -59,8 +60,8 @@ def record(
 ) -> None:
     """Record everything that is published under machines' keys until Ctrl-C.
 
-    A monitor records by itself if its settings say so; this is for recording without one. Older files are dropped; what
-    lies around an alarm in the history of a monitor on this computer is kept longer.
+    A monitor records by itself if its settings say so; this is for recording without one. Older files are deleted;
+    those around an alarm in the history of a monitor on this computer are kept longer.
 
     [bold]Examples[/bold]
 
@@ -115,7 +116,7 @@ def record(
 
 @commands.command()
 def recover(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="What a crash left, usually NAME.mcap.part.")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Left by a crash, usually NAME.mcap.part.")],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -126,9 +127,9 @@ def recover(
         ),
     ] = None,
 ) -> None:
-    """Recover recordings whose writer was killed, and damaged ones; say what was recovered and what was lost.
+    """Recover damaged recordings and those whose writer was killed; report what was recovered and what was lost.
 
-    The damaged file stays. A recorder recovers what it left itself when it is started again.
+    The damaged file stays. A recorder that is started again recovers its own files by itself.
 
     [bold]Example[/bold]
 

@@ -30,7 +30,7 @@ _SLOWEST, _FASTEST = 0.1, 1000.0
 
 NamespaceOption = Annotated[
     str | None,
-    typer.Option("--namespace", metavar="PREFIX", help="Listen and publish only below this prefix: that of a replay."),
+    typer.Option("--namespace", metavar="PREFIX", help="Receive and publish only below this prefix, that of a replay."),
 ]
 
 
@@ -138,16 +138,16 @@ def replay(
 ) -> None:
     """Replay recordings: offline through the monitor, or onto the network byte for byte.
 
-    On the network a replay stays apart from what is live: its keys begin with a prefix, and a monitor hears them
-    only as its namespace. In a terminal the space bar pauses and the arrow keys go 10 s back and forth. All times are
-    those of the data, however fast they were recorded.
+    On the network a replay stays apart from live data: its keys begin with a prefix, and a monitor receives them only
+    with that prefix as its namespace. In a terminal the space bar pauses and the arrow keys go 10 s back and forth. All
+    times are those of the data, however fast they were recorded.
 
     [bold]Examples[/bold]
 
-    What the monitor says of a recording:
+    Reports of the monitor on a recording:
     [cyan]rotorwatch replay 20260101T000000Z.mcap --offline --out reports.jsonl[/cyan]
 
-    What it would have said with other limits, of a whole day:
+    Reports on a whole day, with other limits:
     [cyan]rotorwatch replay day/*.mcap --offline --machine stricter.toml@lab --out stricter.jsonl[/cyan]
     [cyan]rotorwatch replay day/*.mcap --offline --set alarms.parameters.k_by.raise_above=0.2 --out calmer.jsonl[/cyan]
 

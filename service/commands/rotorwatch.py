@@ -34,8 +34,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Condition monitoring of rotating machines: which parameter changed, by how much, and how sure it is.",
-    epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used. Of status "
-    "also: 3 no data, 4 no answer.",
+    epilog="Exit codes: 0 success, 1 error at run time, 2 unusable file or argument; of status also 3 no "
+    "data, 4 no answer.",
 )
 
 
@@ -130,10 +130,10 @@ def fleet(
 ) -> None:
     """Monitor the machines of a fleet on the computers of a Ray cluster, until Ctrl-C.
 
-    Ray gives each group of machines a computer with room, and another one when that is lost; this process serves HTTP,
-    the page, metrics and webhooks for all of them. It needs a history in PostgreSQL, Zenoh routers that sensors and
-    computers connect to, and an endpoint of its own: see "Fleets" in docs/service.md, also for the health checks with
-    which Ray notices sooner that a computer is lost.
+    Ray places each group of machines on a computer with room, and on another when that is lost; this process serves
+    HTTP, the page, metrics and webhooks for all of them. It needs a history in PostgreSQL, Zenoh routers that sensors
+    and computers connect to, and an endpoint of its own: see "Fleets" in docs/service.md, also for the health checks
+    with which Ray notices sooner that a computer is lost.
 
     [bold]Example[/bold]
 

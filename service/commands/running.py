@@ -33,7 +33,7 @@ _ADDRESS_SPACE_MB = 2_000
 _OF_A_MACHINE_MB = 100  # mostly thread stacks and reservations of libraries, of which little is used
 
 HistoryOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts.")
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] is used.")
 ]
 ConnectOption = Annotated[
     list[str] | None,
@@ -54,7 +54,7 @@ FromOption = Annotated[
     typer.Option(
         "--from",
         metavar="TIME",
-        help="Data from then on: seconds after their start, or a time of the data such as 2026-01-01T00:02:30Z (UTC).",
+        help="Data from this time on: seconds after their start, or a data time such as 2026-01-01T00:02:30Z (UTC).",
     ),
 ]
 ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data before this time; same format.")]

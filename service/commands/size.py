@@ -19,20 +19,24 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 @commands.command()
 def size(
-    machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="How many.")],
-    channels: Annotated[int, typer.Option("--channels", min=1, max=1000, help="Of each, with the shaft angle.")] = 9,
+    machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="Number of machines.")],
+    channels: Annotated[
+        int, typer.Option("--channels", min=1, max=1000, help="Per machine, shaft angle included.")
+    ] = 9,
     rate: Annotated[
         float, typer.Option("--rate", metavar="HZ", min=1.0, max=1e6, help="Samples per second and channel.")
     ] = 2000.0,
     hop: Annotated[float, typer.Option("--hop", metavar="S", min=0.1, help="Seconds between reports.")] = 5.0,
     levels_only: Annotated[
-        bool, typer.Option("--levels-only", help="Vibration levels are watched, nothing is diagnosed.")
+        bool, typer.Option("--levels-only", help="Only watch vibration levels; diagnose nothing.")
     ] = False,
     networks: Annotated[bool, typer.Option(help="Trained networks in addition to the likelihood.")] = True,
-    cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Of a computer.")] = 8,
+    cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Per computer.")] = 8,
     busy: Annotated[
         float,
-        typer.Option("--busy", min=0.05, max=1.0, callback=finite, help="How much of them may be used on average."),
+        typer.Option(
+            "--busy", min=0.05, max=1.0, callback=finite, help="Part of the cores that may be used on average."
+        ),
     ] = 0.6,
     reports_days: Annotated[
         float | None, typer.Option("--reports-days", metavar="DAYS", help="How long reports are kept.")
@@ -44,14 +48,14 @@ def size(
         float | None, typer.Option("--keep-days", metavar="DAYS", help="How long recordings without an alarm are kept.")
     ] = None,
     keep_gb: Annotated[
-        float | None, typer.Option("--keep-gb", metavar="GB", help="Most that is kept of them per machine.")
+        float | None, typer.Option("--keep-gb", metavar="GB", help="Most kept of these recordings per machine.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
 ) -> None:
     """Estimate what a plant needs: processor, memory, disk, network, processes and computers.
 
-    From figures that were measured on simulated machines, and a model between them, both shown with the result.
-    Things are kept as long as they are by default, unless it is given. Page, API and other programs come on top.
+    The estimate rests on figures measured on simulated machines and a model between them, both shown with the result.
+    Retention times are the defaults unless given. The page, the API and other programs need resources in addition.
 
     [bold]Examples[/bold]
 

@@ -39,7 +39,7 @@ _STYLES = {
 @commands.command()
 def watch(
     machine: Annotated[
-        str, typer.Option("--machine", metavar="SITE/MACHINE", help="Which machine; * stands for any.")
+        str, typer.Option("--machine", metavar="SITE/MACHINE", help="Machine to show; * stands for any.")
     ] = "*/*",
     connect: ConnectOption = None,
     link: LinkOption = None,
@@ -91,7 +91,7 @@ def watch(
 
 @commands.command()
 def status(
-    url: Annotated[str, typer.Option("--url", help="Where the monitor's HTTP API is.")] = "http://127.0.0.1:8080",
+    url: Annotated[str, typer.Option("--url", help="Address of the monitor's HTTP API.")] = "http://127.0.0.1:8080",
     token: Annotated[
         str | None,
         typer.Option(

@@ -12,7 +12,7 @@ commands = typer.Typer(name="webhook", no_args_is_help=True, help="Programs that
 
 @commands.command()
 def secret() -> None:
-    """Make a secret, with which events are signed; the receiver needs the same.
+    """Create a secret for signing events; the receiver needs the same one.
 
     [bold]Example[/bold]
 
@@ -25,10 +25,10 @@ def secret() -> None:
 
 @commands.command()
 def test(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Which webhook of the settings.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the webhook in the settings.")],
     config: Annotated[Path, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor.")],
 ) -> None:
-    """Send a test event, which is no alarm, and say whether the receiver took it; exit code 1 if it did not.
+    """Send a test event, which is not an alarm, and report whether the receiver accepts it; exit code 1 if not.
 
     [bold]Example[/bold]
 

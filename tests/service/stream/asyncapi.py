@@ -20,9 +20,10 @@ from rotorwatch.records.health import Health, Report
 from service.stream.log_query import MOST_EVENTS
 
 _JSON = "application/json"
-_DESCRIPTION = """Which parameter of a rotating machine changed, by how much, how sure: what a rotorwatch monitor hears
-and publishes over Zenoh. JSON is UTF-8; numbers are finite or null and carry their unit in their name; `..._ns` are
-nanoseconds since 1970-01-01 UTC, data time. What is replayed has the prefix of the replay before the same keys."""
+_DESCRIPTION = """Which parameter of a rotating machine changed, by how much, how sure: what a rotorwatch monitor
+receives and publishes over Zenoh. JSON is UTF-8; numbers are finite or null and carry their unit in their name;
+`..._ns` are nanoseconds since 1970-01-01 UTC, data time. Replayed data have the same keys after the prefix of the
+replay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,19 +39,21 @@ class _Topic:
 
 _TOPICS: dict[str, _Topic] = {
     "stream": _Topic("Sample blocks; docs/wire.md has the format.", "receive", None, "application/x-rotorwatch-block"),
-    "descriptor": _Topic("What the columns of the stream are; also by query.", "receive", ChannelDescriptor),
+    "descriptor": _Topic("Description of the stream's columns; also by query.", "receive", ChannelDescriptor),
     "truth": _Topic("What a simulator did to the machine; real machines send none, and no monitor listens."),
     "report": _Topic("One evaluated window. Dropped when the network is congested.", "send", Report),
-    "health": _Topic("Where the machine stands, when there is news; also by query.", "send", Health, answered=True),
+    "health": _Topic(
+        "Current health of the machine, whenever it changes; also by query.", "send", Health, answered=True
+    ),
     "alarm_event": _Topic(
-        "What happened to an alarm: a CloudEvent, each with its number in the machine's log, committed before it is "
-        "sent. It may be heard more than once, with the same number and id.",
+        "An alarm event: a CloudEvent with its sequence number in the machine's log, committed before it is sent. It "
+        "may be received more than once, with the same number and id.",
         "send",
         AlarmCloudEvent,
         "application/cloudevents+json",
     ),
     "alarm_state": _Topic("Alarms that are not normal; also by query.", "send", AlarmStates, answered=True),
-    "publisher_alive": _Topic("Liveliness token of whoever publishes the stream; no payload."),
+    "publisher_alive": _Topic("Liveliness token of the publisher of the stream; no payload."),
     "monitor_alive": _Topic("Liveliness token of the monitor; no payload."),
     "replay_alive": _Topic("Liveliness token of a replay on the machine's own keys; no payload."),
 }
@@ -76,8 +79,8 @@ def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
             "parameters": {
                 "site": {"description": "site of the machine", "examples": ["demo"]},
                 "machine": {"description": "name of the machine", "examples": ["lab"]},
-                "after": {"description": "sequence number after which; -1 for the beginning", "default": "-1"},
-                "limit": {"description": f"at most so many events, 1 to {MOST_EVENTS}", "default": "100"},
+                "after": {"description": "only events after this sequence number; -1 for all", "default": "-1"},
+                "limit": {"description": f"at most this many events, 1 to {MOST_EVENTS}", "default": "100"},
             },
         },
     }  # fmt: skip
@@ -109,12 +112,12 @@ def _add_topic(document: dict[str, Any], name: str, address: str, topic: _Topic,
             "messages": [{"$ref": f"#/channels/{name}/messages/{name}"}],
         }
     if topic.answered:
-        _add_question(document, name, name, f"A question is answered with what {name} would say now.")
+        _add_question(document, name, name, f"A query is answered with the present {name}.")
 
 
 def _add_log(document: dict[str, Any]) -> None:
     address = f"{document['channels']['alarm_event']['address']}?after={{after}};limit={{limit}}"
-    channel = document["channels"]["alarm_log"] = _channel(address, "The alarm log, by query, from any event on.")
+    channel = document["channels"]["alarm_log"] = _channel(address, "The alarm log from any event on, by query.")
     channel["parameters"] |= {name: _reference("parameters", name) for name in ("after", "limit")}
     channel["messages"] = {"alarm_log": _reference("messages", "alarm_log")}
     document["components"]["messages"]["alarm_log"] = {
@@ -123,7 +126,7 @@ def _add_log(document: dict[str, Any]) -> None:
         "payload": _reference("schemas", AlarmLogPage.__name__),
         "examples": [{"payload": example(AlarmLogPage)}],
     }
-    _add_question(document, "alarm_log", "alarm_log", "A question is answered with the events after the given one.")
+    _add_question(document, "alarm_log", "alarm_log", "A query is answered with the events after the given one.")
 
 
 def _add_question(document: dict[str, Any], channel: str, message: str, text: str) -> None:
