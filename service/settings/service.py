@@ -324,7 +324,10 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         history = history.model_copy(update={"url": _beside(folder, history.url)})
     recording = settings.recording
     if recording.directory is not None:
-        recording = recording.model_copy(update={"directory": str(folder / recording.directory)})
+        directory = folder / recording.directory
+        if directory.exists() and not directory.is_dir():
+            raise MachineFileError(f"{place}: recording.directory: {directory} is not a folder, expected one")
+        recording = recording.model_copy(update={"directory": str(directory)})
     update = {"machines": entries, "recording": recording, "history": history}
     settings = in_folder(settings, folder).model_copy(update=update)
     check_distinct(place, settings)
