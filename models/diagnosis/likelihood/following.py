@@ -30,6 +30,7 @@ from models.diagnosis.likelihood.spectral_model import (
     Expected,
     ModelPoint,
     SpectralModel,
+    Speeds,
     factor_of,
     packed,
 )
@@ -101,7 +102,7 @@ class Linearised:
             "point_levels": self._point.C,
             "speeds_rad_s": np.array(
                 [self._searched_rad_s, self._point.speed_rad_s, self.derivatives.speed_rad_s], dtype=np.float64
-            ),
+            ).ravel(),
             "information": np.diag(self.derivatives.information),
             "left": self._left,
             "fitted": np.array(self._fitted, dtype=np.float64),
@@ -120,7 +121,10 @@ class Linearised:
         """
         size = (model.size,)
         theta = checked(arrays, "searched", np.float64, size)
-        of_searched, of_point, of_slopes = checked(arrays, "speeds_rad_s", np.float64, (3,)).tolist()
+        speeds = checked(arrays, "speeds_rad_s", np.float64, (3 * model.groups.speeds,)).tolist()
+        of_searched, of_point, of_slopes = (
+            speeds if model.groups.speeds == 1 else zip(speeds[::2], speeds[1::2], strict=True)
+        )
         levels = checked(arrays, "point_levels", np.float64, (6, 6))
         point = checked(arrays, "point", np.float64, size)
         if not (np.all(np.isfinite(theta)) and np.all(np.isfinite(point)) and np.all(np.isfinite(levels))):
@@ -139,7 +143,7 @@ class Linearised:
             float(checked(arrays, "fitted", np.float64, ())),
         )
 
-    def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
+    def follow(self, observed: ComplexArray, speed_rad_s: Speeds, near: float, gain: float) -> Maximum | None:
         """Find the maximum for the next window's estimated spectra, in the model's units; None if a new search is due.
 
         `near` and `gain` define convergence as in `FisherScoring.maximise`.
@@ -222,7 +226,7 @@ class Linearised:
             self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return self._inverses[share]
 
-    def _moved(self, point: Expected, step: FloatArray, speed_rad_s: float) -> ModelPoint:
+    def _moved(self, point: Expected, step: FloatArray, speed_rad_s: Speeds) -> ModelPoint:
         """The point after a step: logarithms move by at most one, noise variances and C linearly."""
         model = self.model
         theta = point.theta.copy()

@@ -63,6 +63,7 @@ class BinGroups:
     # (n_groups, n_groups): squared correlations of the groups' scatter, relative to the variance that
     # `AVERAGES_PER_BIN` implies: a group of few bins scatters less than that, and correlates with its neighbours
     shared: FloatArray
+    speeds: int = 1  # number of speeds that the theory is averaged over; all nodes are repeated for each
 
     def average(self, spectrum: ComplexArray) -> ComplexArray:
         """Average estimated cross-spectra over each group, shape (n_groups, n, n)."""
@@ -79,8 +80,9 @@ class BinGroups:
         return divided(sums, segments.shape[1] * self.bins[:, None, None])
 
     def same_as(self, other: "BinGroups") -> bool:
-        """Whether other groups hold the same bins at the same frequencies."""
-        return self.edges == other.edges and np.array_equal(self.centre_hz, other.centre_hz)
+        """Whether other groups hold the same bins at the same frequencies, for as many speeds."""
+        alike = self.edges == other.edges and self.speeds == other.speeds
+        return alike and np.array_equal(self.centre_hz, other.centre_hz)
 
 
 @lru_cache(maxsize=8)
@@ -102,11 +104,11 @@ def natural_frequencies(machine: Machine) -> tuple[FloatArray, FloatArray]:
 
 
 def group_bins(
-    frequencies_hz: FloatArray, machine: Machine, excluded: npt.NDArray[np.bool_], widest_hz: float
+    frequencies_hz: FloatArray, machine: Machine, excluded: npt.NDArray[np.bool_], widest_hz: float, speeds: int = 1
 ) -> BinGroups:
     """Group evenly spaced bins: narrow near the machine's nominal modes, at most `widest_hz` elsewhere.
 
-    Bins that are excluded, shape (n_bins,), belong to no group.
+    Bins that are excluded, shape (n_bins,), belong to no group. The theory is averaged over a number of `speeds`.
     """
     spacing = frequencies_hz[1] - frequencies_hz[0]
     modes_hz, damping = natural_frequencies(machine)
@@ -139,9 +141,10 @@ def group_bins(
         edges=tuple(edges),
         bins=np.array([end - first for first, end in edges], dtype=np.float64),
         centre_hz=np.array([frequencies_hz[first:end].mean() for first, end in edges]),
-        nodes_hz=nodes_hz,
-        weights=weights,
+        nodes_hz=np.tile(nodes_hz, speeds),
+        weights=np.tile(weights, speeds) / speeds,
         shared=_shared_scatter(edges, frequencies_hz.size),
+        speeds=speeds,
     )
 
 

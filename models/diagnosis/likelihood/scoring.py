@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, Speeds, packed
 from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
@@ -44,7 +44,7 @@ class Derivatives:
 
     slopes: FloatArray  # (size, n_groups, n²)
     information: FloatArray  # (size, size), of the data without pulls, levels as elements of C
-    speed_rad_s: float  # speed for which they were computed
+    speed_rad_s: Speeds  # speed for which they were computed
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Maximum:
     information: FloatArray  # (size, size), Fisher information there, on the elements of C (not of T)
     slopes: FloatArray  # (size, n_groups, n²), whitened slopes that the information is made of
     # Speed for which they were computed: that of the window, or of the search whose slopes were reused.
-    slopes_rad_s: float
+    slopes_rad_s: Speeds
     whitened: Whitened  # theory and estimate there
     steps: int  # steps tried
     fitted: float  # effective number of parameters that the window determined, not the weak pulls
@@ -119,7 +119,7 @@ class FisherScoring:
         model: SpectralModel,
         observed: ComplexArray,
         n_segments: int,
-        speed_rad_s: float,
+        speed_rad_s: Speeds,
         usual_cutoff_hz: float,
         strength: float | None = None,
     ) -> None:

@@ -37,6 +37,12 @@ from models.signals.block import FloatArray
 
 # Parameters that shape the spectra, in the order of the parameter vector.
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
+Speeds = float | tuple[float, float]
+"""Speed of the gyroscopic terms, rad/s; where it varies within a window, two of the same mean and standard deviation.
+
+The spectra are averaged over both. With a single source, motions at one speed are fully coherent but for noise, and
+those at a mixture of speeds are not, which would pass for a misfit.
+"""
 SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
 ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
 _BEARING_DOFS = (0, 0, 3, 3)
@@ -49,7 +55,7 @@ class Expected:
     theta: FloatArray  # (size,), the parameter point
     S: ComplexArray  # (n_groups, n, n), cross-spectral matrices
     C: FloatArray  # (6, 6), level matrix
-    speed_rad_s: float  # speed of the gyroscopic terms
+    speed_rad_s: Speeds
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +65,7 @@ class ModelPoint(Expected):
     # (n_groups, n_nodes, n, 6): transfer from forces (in units of C, coloured) to measured motions, times the root of
     # the node's weight
     G: ComplexArray
-    receptance: ComplexArray  # (n_frequencies, 6, 6), of all six degrees of freedom, SI, at distinct frequencies
+    receptance: ComplexArray  # (n_distinct, 6, 6), of all six degrees of freedom, SI, distinct frequencies by speed
     place: npt.NDArray[np.intp]  # (n_groups, n_nodes), index of each node's receptance among these
     unit: FloatArray  # (n_groups, 1, 1, 6), the forces' units and D
 
@@ -123,7 +129,9 @@ class SpectralModel:
         self._b = eval_legendre(np.arange(1, self.shapes + 1), x[:, None])
         self._w = 2 * np.pi * groups.nodes_hz
         # Neighbouring groups share nodes and are padded to equal numbers: with light damping half are duplicates.
-        self._distinct_w, self._place = np.unique(self._w, return_inverse=True)
+        self._distinct_w, place = np.unique(self._w, return_inverse=True)
+        speed = np.arange(groups.speeds).repeat(self._w.shape[1] // groups.speeds)
+        self._place = place.reshape(self._w.shape) + self._distinct_w.size * speed
         self.centre = 2 * np.pi * groups.centre_hz
         self._factor = self.motions.factor(self._w, self.centre[:, None])
         shares = self.motions.shares(self.centre)
@@ -175,9 +183,13 @@ class SpectralModel:
         T[ROWS, COLUMNS] = theta[self.level_at]
         return T
 
-    def at(self, theta: FloatArray, speed_rad_s: float, C: FloatArray | None = None) -> ModelPoint:
-        """Expected spectra at a parameter point, with the level matrix C instead of its own if given."""
-        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, self._distinct_w)
+    def at(self, theta: FloatArray, speed_rad_s: Speeds, C: FloatArray | None = None) -> ModelPoint:
+        """Expected spectra at a parameter point, with the level matrix C instead of its own if given.
+
+        There are as many speeds as `groups` have.
+        """
+        speeds = speed_rad_s if isinstance(speed_rad_s, tuple) else (speed_rad_s,)
+        H = np.concatenate([self.receptance(theta[: self.cutoff_at], one, self._distinct_w) for one in speeds])
         colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
         unit = self.force_unit * colour[:, None, None, :]
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
@@ -331,7 +343,7 @@ _VISIBLE = 0.02
 _LEAST_LEVEL = 1e-3
 
 
-def usual_force(machine: Machine, motions: Motions, groups: BinGroups, speed_rad_s: float, cutoff_hz: float) -> float:
+def usual_force(machine: Machine, motions: Motions, groups: BinGroups, speed_rad_s: Speeds, cutoff_hz: float) -> float:
     """Unit of force, N/√Hz, in which equal independent sources of level one cause the mean power that was measured.
 
     A parameter point therefore stays a good start when the machine merely becomes louder.

@@ -11,7 +11,7 @@ from benchmarks.studies.methods.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins
 from models.diagnosis.likelihood.scoring import FisherScoring
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, Speeds, packed
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.diagnosis.window.statistics import WindowStatistics
@@ -20,7 +20,17 @@ from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
 from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
-from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
+from simulator.scenario import Event
+from simulator.training.draws import (
+    Anomaly,
+    Draw,
+    Excitation,
+    Layout,
+    Purpose,
+    draw_condition,
+    simulate_scenario,
+    simulate_window,
+)
 from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
 from tests.windows import statistics
@@ -30,9 +40,9 @@ SEED = 7_700_001
 """Used for the windows of this file alone, not for training, calibration or the shipped scenarios."""
 
 
-def groups_of(machine: Machine, widest_hz: float = 1.0) -> BinGroups:
+def groups_of(machine: Machine, widest_hz: float = 1.0, speeds: int = 1) -> BinGroups:
     frequencies_hz = plan_for(machine).frequencies_hz
-    return group_bins(frequencies_hz, machine, np.abs(frequencies_hz - 22) < 1.6, widest_hz)
+    return group_bins(frequencies_hz, machine, np.abs(frequencies_hz - 22) < 1.6, widest_hz, speeds)
 
 
 def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
@@ -79,22 +89,23 @@ def test_the_receptance_is_the_inverse_of_the_dynamic_matrix(name: str) -> None:
         assert np.abs(off).max() < 1e-9
 
 
-def test_slopes_of_the_spectra_equal_numerical_derivatives() -> None:
+@pytest.mark.parametrize("speed", [140.0, (100.0, 180.0)])
+def test_slopes_of_the_spectra_equal_numerical_derivatives(speed: Speeds) -> None:
     rng = np.random.default_rng(0)
     states = plan_for(LAB).states
     scale = np.where([name.endswith("dot") for name in states], 0.04, 2e-4)
-    model = SpectralModel(LAB, Motions(states, scale), groups_of(LAB, 8.0), 2.0)
+    model = SpectralModel(LAB, Motions(states, scale), groups_of(LAB, 8.0, np.size(speed)), 2.0)
     theta = rng.normal(0, 0.2, model.size)
     theta[model.cutoff_at], theta[model.order_at] = np.log(80), np.log(2.5)
     theta[model.noise_at] -= 5
     theta[model.level_at] += np.eye(6)[ROWS, COLUMNS]
-    point = model.at(theta, 140.0)
+    point = model.at(theta, speed)
     mixing = rng.normal(size=point.S.shape) + 1j * rng.normal(size=point.S.shape)
     slopes = model.slopes(point, mixing)
     for parameter in range(model.level_at.start):
         step = np.zeros(model.size)
         step[parameter] = 1e-5
-        difference = (model.at(theta + step, 140.0).S - model.at(theta - step, 140.0).S) / 2e-5
+        difference = (model.at(theta + step, speed).S - model.at(theta - step, speed).S) / 2e-5
         expected = packed(mixing @ difference @ mixing.conj().swapaxes(1, 2))
         np.testing.assert_allclose(slopes[parameter], expected, atol=1e-6 * np.abs(expected).max())
     C = model.levels(theta)
@@ -102,7 +113,7 @@ def test_slopes_of_the_spectra_equal_numerical_derivatives() -> None:
         change = np.zeros((6, 6))
         change[row, column] = change[column, row] = 1e-5
         T = np.linalg.cholesky(C + change)[ROWS, COLUMNS], np.linalg.cholesky(C - change)[ROWS, COLUMNS]
-        S = [model.at(np.concatenate([theta[: model.level_at.start], part]), 140.0).S for part in T]
+        S = [model.at(np.concatenate([theta[: model.level_at.start], part]), speed).S for part in T]
         expected = packed(mixing @ (S[0] - S[1]) @ mixing.conj().swapaxes(1, 2)) / 2e-5
         np.testing.assert_allclose(slopes[model.level_at.start + number], expected, atol=1e-5 * np.abs(expected).max())
 
@@ -172,6 +183,20 @@ def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout
     assert all((diagnosis.misfit_z or 0) < most for diagnosis in diagnoses)
     if layout is Layout.ONE_SOURCE:  # the bound is sensor noise here: hundredths of a percent
         assert np.median([[one.standard_error for one in diagnosis.parameters[:2]] for diagnosis in diagnoses]) < 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(3))
+def test_a_single_source_at_a_wandering_speed_is_within_the_model(number: int) -> None:
+    """The theory at the mean speed alone deviates by 30 standard errors and more."""
+    machine = load_machine("light")
+    drawn = draw_condition(Draw(machine, SEED, Purpose.EVALUATION, 31, layout=Layout.ONE_SOURCE), number)
+    course = machine.operation.speed_rpm * (1 + 0.03 * np.sin(2 * np.pi * np.arange(66) / 60))
+    events = (Event(at_s=at_s, speed_rpm=speed) for at_s, speed in enumerate(course.tolist()))
+    scenario = drawn.model_copy(update={"events": tuple(events)})
+    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(scenario, machine))
+    assert sure(diagnosis.misfit_z) < 4
+    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
 
 
 @pytest.mark.slow

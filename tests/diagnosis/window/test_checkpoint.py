@@ -115,24 +115,32 @@ def test_a_monitor_stopped_at_any_block_continues_bit_for_bit(machine: str, reco
 
 
 @lru_cache
-def windows() -> tuple[WindowStatistics, ...]:
-    """Sixteen windows at speeds that are never quite the same, but always between the same two frequencies."""
+def windows(spread: float = 0.0) -> tuple[WindowStatistics, ...]:
+    """Sixteen windows at speeds that are never quite the same, but always between the same two frequencies.
+
+    Within each the speed wanders by `spread`.
+    """
     rng, looser = np.random.default_rng(3), Event(at_s=130.0, parameter="c_bz", relative_change=0.6)
     stream = scenario_blocks(138.0, looser)
     return tuple(
-        replace(full, speed_rad_s=full.speed_rad_s * (1.002 + 1e-4 * rng.standard_normal()))
+        replace(
+            full,
+            speed_rad_s=full.speed_rad_s * (1.002 + 1e-4 * rng.standard_normal()),
+            hop_speed_rad_s=full.hop_speed_rad_s * np.linspace(1 - spread, 1 + spread, full.hop_speed_rad_s.size),
+        )
         for full in full_windows(SlidingWindow(plan_for(LAB, lagged=False)), stream)
     )
 
 
 @pytest.mark.slow
-def test_a_maximum_followed_over_many_windows_continues_bit_for_bit() -> None:
+@pytest.mark.parametrize("spread", [0.0, 0.01])
+def test_a_maximum_followed_over_many_windows_continues_bit_for_bit(spread: float) -> None:
     """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
     fit = LikelihoodFit(LAB, follow=True)
-    expected = [fit.diagnose(window) for window in windows()]
+    expected = [fit.diagnose(window) for window in windows(spread)]
     assert len(expected) == 16
     running = LikelihoodFit(LAB, follow=True)
-    for window, diagnosis in zip(windows(), expected, strict=True):
+    for window, diagnosis in zip(windows(spread), expected, strict=True):
         again = LikelihoodFit(LAB, follow=True)
         again.restore(from_bytes(to_bytes(running.checkpoint())))
         found = again.diagnose(window)
