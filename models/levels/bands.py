@@ -25,7 +25,7 @@ NYQUIST_PART = 0.8
 _PER_OCTAVE = 12
 _FIRST_BIN = 2
 """The taper spreads the mean over the bins before it."""
-_COUNTS = 0.01
+_LEAST_RMS = 0.01
 """Fraction of a channel's rms below which a band is ignored: it is mostly sensor noise."""
 _CHANCE = 1e-9
 NEIGHBOURHOOD = 2.0 ** (1 / _PER_OCTAVE) - 1
@@ -144,7 +144,7 @@ def band_limits(
 def growth(levels: BandLevels, limits: BandLimits) -> list[Growth | None]:
     """Compare every channel's bands with its reference; None where there is nothing to compare."""
     now, columns = levels.rms, np.arange(levels.rms.shape[1])
-    looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2, axis=0))) & (limits.own > 0)
+    looked_at = (now > _LEAST_RMS * np.sqrt(np.sum(now**2, axis=0))) & (limits.own > 0)
     ratios = np.divide(now, limits.own, out=np.full(now.shape, np.inf), where=looked_at)
     count = looked_at.sum(axis=0)
     ratios.sort(axis=0)

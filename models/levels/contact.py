@@ -26,10 +26,10 @@ _FAR_OUT = (0.02, 0.15)
 _BEFORE = 2
 """The second test counts the shaft as far out only if it was so this many samples earlier (one of the lags) as well. A
 stiff contact is over by then and the shaft returns later than predicted: the first test, without this, shows it."""
-_OFF = 8.0
+_SPIKE_RATIO = 8.0
 """A sample whose remainder exceeds its mean size this many times is a spike: it counts as far out only if the shaft was
 so before as well. No sample of a Gaussian vibration is that far off its prediction."""
-_LEAST = 1000
+_FEWEST = 1000
 """Fewest samples: of fewer, hardly any are far out."""
 _FITTED = 4
 """The predictor is fitted to one sample in this many, which is enough."""
@@ -68,13 +68,13 @@ def contact(
     size, steps = pair.shape[1], np.abs(np.diff(pair))
     step = np.min(steps, axis=1, where=steps > 0, initial=np.inf)
     coarse = bool(np.any(_STEPS * step > pair.std(axis=1)) and np.all(np.isfinite(step)))
-    every = max(1, int(min(size / (_PER_TURN * max(abs(revolutions), 1.0)), rate_hz / _LEAST_HZ, size / _LEAST)))
+    every = max(1, int(min(size / (_PER_TURN * max(abs(revolutions), 1.0)), rate_hz / _LEAST_HZ, size / _FEWEST)))
     kept = size // every
     if every > 1:
         pair = pair[:, : kept * every].reshape(2, kept, every).mean(axis=2)
         turning = turning[:, every // 2 :: every]
     largest = float(np.abs(pair).max())
-    if kept < _LEAST or largest == 0 or coarse:
+    if kept < _FEWEST or largest == 0 or coarse:
         return np.full(len(_FAR_OUT), np.nan)
     x, first = pair / largest, max(_LAGS)
     latest = [x[:, first - lag : kept - 1 - lag] for lag in _LAGS]
@@ -99,7 +99,7 @@ def contact(
     remainder = unpredicted(x[:, first + 1 :])
     both = np.minimum(square, before)
     size = np.abs(remainder)
-    off = np.any(size > _OFF * size.mean(axis=1, keepdims=True), axis=0)[:-1]
+    off = np.any(size > _SPIKE_RATIO * size.mean(axis=1, keepdims=True), axis=0)[:-1]
     square[1:][off] = both[1:][off]
     limits, pushes = [], []
     for part, far in zip(_FAR_OUT, (square, both), strict=True):

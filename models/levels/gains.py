@@ -17,14 +17,14 @@ from models.levels.bands import BandLevels
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 
-_BANDS = 4
-_COUNTS = 0.01
+_PER_THIRD = 4
+_LEAST_RMS = 0.01
 """Fraction of a channel's rms below which a third octave is ignored: it is mostly sensor noise."""
 _FEWEST_PLACES, _FEWEST_THIRDS = 3, 4
-_LEAST = 0.08
+_LEAST_LOG_GAIN = 0.08
 """Least change of a gain that is reported, as a natural logarithm; sensors differ by smaller ones anyway."""
 _SCATTER = 0.005
-_FITS, _EXPLAINED = 4.0, 0.25
+_MOST_LEFT, _MOST_LEFT_PART = 4.0, 0.25
 """Mean square of the contrasts that a gain may leave, in variances of the healthy windows, and relative to that without
 the gain. Healthy windows leave up to 2.4 variances; the change of stiffness and damping that looks most like a gain of
 6 % leaves 0.3 of the mean square."""
@@ -57,7 +57,7 @@ def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]
     freedom = len(windows) - len(recordings)
     if len(names) < _FEWEST_PLACES or freedom < 1:
         return None
-    counts = np.all([_thirds(one.rms) > _COUNTS * np.sqrt((one.rms**2).sum(axis=0)) for one in windows], axis=(0, 2))
+    counts = np.all([_thirds(one.rms) > _LEAST_RMS * np.sqrt((one.rms**2).sum(axis=0)) for one in windows], axis=(0, 2))
     if counts.sum() < _FEWEST_THIRDS:
         return None
     every = [np.array([_levels(one, places)[counts] for one in recording]) for recording in recordings]
@@ -92,7 +92,7 @@ def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReferen
             left = float(np.mean((contrast - factor * of_gain) ** 2 / variance))
             found.append((left, place, factor, float(np.mean(contrast**2 / variance))))
     left, place, factor, without = min(found)
-    if not abs(factor) > _LEAST or not left < min(_FITS, _EXPLAINED * without):
+    if not abs(factor) > _LEAST_LOG_GAIN or not left < min(_MOST_LEFT, _MOST_LEFT_PART * without):
         return None
     return place, float(np.exp(factor))
 
@@ -124,12 +124,14 @@ def _contrast(levels: FloatArray) -> FloatArray:
 
 
 def _edges(levels: BandLevels) -> FloatArray:
-    return levels.edges_hz[:-1][: len(levels.rms) // _BANDS * _BANDS : _BANDS]
+    return levels.edges_hz[:-1][: len(levels.rms) // _PER_THIRD * _PER_THIRD : _PER_THIRD]
 
 
 def _thirds(rms: FloatArray) -> FloatArray:
-    count = len(rms) // _BANDS
-    return np.asarray(np.sqrt((rms[: count * _BANDS] ** 2).reshape(count, _BANDS, -1).sum(axis=1)), dtype=np.float64)
+    count = len(rms) // _PER_THIRD
+    return np.asarray(
+        np.sqrt((rms[: count * _PER_THIRD] ** 2).reshape(count, _PER_THIRD, -1).sum(axis=1)), dtype=np.float64
+    )
 
 
 def _levels(levels: BandLevels, places: Sequence[str]) -> FloatArray:

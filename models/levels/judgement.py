@@ -42,11 +42,11 @@ _ERRORS_OF_CONTACT = 5.0
 """Standard errors from which on a contact is reported: one-sided and Gaussian in theory, chance seldom makes five."""
 _STILL = 0.3
 """Fraction of the effect in several windows that the newest one must show; otherwise the contact is over."""
-_SPREAD = 4.0
+_RANGE_DEVIATIONS = 4.0
 """Range of the windows of a healthy machine, in standard deviations."""
 _ERRORS_OF_DOUBT = 4.0
 """Standard errors from which on a kurtosis casts doubt on a parameter that is named; on its own it takes `ERRORS`."""
-_TURNED_OUT = "1x vector"
+_X1_VECTOR = "1x vector"
 _MOST_KEPT = 16  # sets of limits kept per channel: for its zones, operating states, lengths of a window that fills
 _DEADBAND = 0.9
 
@@ -108,7 +108,7 @@ class LevelJudge:
 
         If lines `moved` to other bands within the window, there is no growth.
         """
-        alike = None if reference is None else self._alike(levels, reference)
+        alike = None if reference is None else self._relative_limits_key(levels, reference)
         relative = None if alike is None else self._relatives[alike]
         grown: Sequence[Growth | None] = [None] * len(self._channels)
         if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
@@ -217,7 +217,7 @@ class LevelJudge:
             [(np.nan,) * 4 if one is None else (one.mean, one.low, one.high, one.error) for one in healthy]
         ).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.log(levels.values["x1"] / mean), np.hypot(error, (high - low) / _SPREAD) / mean
+            return np.log(levels.values["x1"] / mean), np.hypot(error, (high - low) / _RANGE_DEVIATIONS) / mean
 
     def _contact(self, levels: WindowLevels, state: OperatingState, latest: LatestContact, number: int) -> str:
         """Describe where the shaft is pushed back far out, unlike the healthy machine's; empty if nowhere."""
@@ -302,7 +302,7 @@ class LevelJudge:
             [
                 near.normal
                 if near.low <= values[_ROW[name]] < near.high
-                else self._limited(channel, name, values[_ROW[name]], near, words[name], out)
+                else self._judged_limits(channel, name, values[_ROW[name]], near, words[name], out)
                 for name, near in limits.items()
             ]
         )
@@ -328,7 +328,7 @@ class LevelJudge:
             for measure, limit in self._relatives[alike].limits[column].items():
                 limits[measure].append(limit)
         if edge is not None:
-            limits["x1"].append(Limit(_TURNED_OUT, False, alert=edge))
+            limits["x1"].append(Limit(_X1_VECTOR, False, alert=edge))
         return {name: _nearest_limits(name, found) for name, found in limits.items()}
 
     def _standard(self, channel: Channel, speed_rad_s: float | None) -> _Standard | None:
@@ -344,7 +344,7 @@ class LevelJudge:
         first, second, third = (shown_level(channel, measure, edge) for edge in boundaries)
         return name, measure, (first, second, third)
 
-    def _alike(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
+    def _relative_limits_key(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
         """Key of the relative limits of a window, which are computed if no earlier window had the same."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
@@ -355,7 +355,7 @@ class LevelJudge:
             self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
         return alike
 
-    def _limited(
+    def _judged_limits(
         self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str, out: str
     ) -> LevelLimits:
         """On which side of its limits a level is; `out` is the text for a 1x vector out of its acceptance region."""
@@ -364,7 +364,7 @@ class LevelJudge:
             state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
         elif alert is not None and value >= (alert.alert or math.inf):
             state, decided, what = "alert", alert, f"alert limit {alert.alert:.3g} ({alert.source})"
-            if alert.source == _TURNED_OUT:
+            if alert.source == _X1_VECTOR:
                 what = out
         elif fall is not None and value < (fall.fall or 0.0):
             state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
@@ -412,7 +412,7 @@ def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
         fall=None if fall is None else rounded(fall.fall or 0.0),
         source="" if decided is None else decided.source,
         state="normal",
-        bounds=tuple(one.bound() for one in limits if one.source != _TURNED_OUT) if several else (),  # no level's limit
+        bounds=tuple(one.bound() for one in limits if one.source != _X1_VECTOR) if several else (),  # no level's limit
     )
     high = min((alert and alert.alert) or math.inf, (danger and danger.danger) or math.inf)
     return _Nearest(alert, danger, fall, normal, (fall and fall.fall) or 0.0, high)

@@ -127,14 +127,14 @@ def fallen_by_lines(
         of_lines = np.where(alone, np.minimum(in_bands, OF_BIN * strongest), in_bands)
         before = np.where(alone, before * np.minimum(1.0, OF_BIN * np.array(healthy_parts)), before)
         freedom_of_lines = np.where(alone, 2.0, freedom)
-    lines = ~near.any(axis=0) & _steady(of_lines, freedom_of_lines)
+    lines = ~near.any(axis=0) & _holds_line(of_lines, freedom_of_lines)
     fallen = np.maximum((of_lines[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
     beside = np.maximum(in_bands @ near.T - np.abs(orders) ** 2 / 2, 0.0)
-    fallen += ((beside / total[:, None]) ** 2)[:, _steady(beside, near @ freedom)].sum(axis=1)
+    fallen += ((beside / total[:, None]) ** 2)[:, _holds_line(beside, near @ freedom)].sum(axis=1)
     return np.asarray(1.5 * fallen, dtype=np.float64)
 
 
-def _steady(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
+def _holds_line(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
     """Which columns hold the power of a line: the same in every hop, except where it begins or ends.
 
     The power of noise with `freedom` degrees of freedom in a hop has a relative scatter of √(2/freedom).

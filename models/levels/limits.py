@@ -90,7 +90,7 @@ def relative_limits(
                     danger = max(danger, _LEAST_DANGER * overall.mean)
             fall = None  # at another speed a quieter machine is not at fault, as while it runs down
             if seen and name in {"overall", "velocity"} and given.fall_ratio:
-                quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling(one, shorter))
+                quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling_margin(one, shorter))
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
             shown = [None if edge is None else shown_level(channel, name, edge) for edge in (alert, danger, fall)]
             of_channel[name] = Limit(source, False, *shown)
@@ -107,7 +107,7 @@ def relative_limits(
 
 def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:
     factor = 2.0 if channel.quantity in PEAK_TO_PEAK else math.sqrt(0.5)  # level of a line over its amplitude
-    farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / factor)
+    farthest = max(BEYOND_RANGE * one.turned, one.turned + _filling_margin(one, shorter) * one.mean / factor)
     by_chance = ERRORS * one.error * shorter / factor
     return Region(centre, max(_TURNED * abs(centre), farthest, by_chance), alert, one.mean)
 
@@ -117,13 +117,13 @@ def _shorter(state: OperatingState, hops: int) -> float:
     return math.sqrt(max(1.0, state.hops / hops))
 
 
-def _filling(one: ReferenceLevel, shorter: float) -> float:
+def _filling_margin(one: ReferenceLevel, shorter: float) -> float:
     """Relative margin for the scatter of a level about that of a full window; zero once the window is full."""
     return ERRORS * one.error / one.mean * math.sqrt(shorter**2 - 1) if one.mean else 0.0
 
 
 def _alert_from(one: ReferenceLevel, given: LevelSettings, shorter: float) -> float:
-    loudest = one.high * max(BEYOND_RANGE, 1 + _filling(one, shorter))
+    loudest = one.high * max(BEYOND_RANGE, 1 + _filling_margin(one, shorter))
     return max(given.alert_ratio * one.mean, loudest, one.mean + ERRORS * one.error * shorter)
 
 

@@ -21,16 +21,16 @@ _HAD_ONE = 0.25
 _NOISE, _STEADY = 2.0, 1e-3
 """If the speed varied by more than `_STEADY` (relative) between the healthy hops of a window, lines were spread over
 several bins, and become narrower at a steadier speed: a share above `_NOISE` times that of noise may have been one."""
-_MOVED = 1.35
+_MODE_SHIFT = 1.35
 """Factor by which a mode's natural frequency may differ from that of the machine file, or have changed."""
-_OTHERS = 0.16
+_OTHER_MODES_SHARE = 0.16
 """Share that theory allows the strongest bin of any band: a machine has modes that its file does not describe."""
 _SCATTERS, _MODE, _LIKE_A_LINE = 1.8, 0.2, 0.45
 """Share allowed in a window over the mean share of a mode's strongest bin; the most that is allowed; and the mean share
 from which on a mode cannot be distinguished from a line. In 36 windows of the rotor kits, each in conditions of its own
 (seed 20261341), the strongest bins had up to 0.26 where modes are damped by 0.1 % and the mean would be 0.40, and up to
 0.21 where it would be 0.15."""
-_LOUD = 0.02
+_LEAST_SHARE = 0.02
 """Least share of its channel's power without 1x that a reported line has, as of lines that diagnosis leaves out."""
 
 
@@ -50,7 +50,7 @@ def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, u
     """
     largest = np.asarray(np.max(windows, axis=0), dtype=np.float64)
     if unsteady > _STEADY:
-        largest[largest > _NOISE * _of_noise(_bins(bands, hops))[:, None]] = 1.0
+        largest[largest > _NOISE * _noise_share(_bins(bands, hops))[:, None]] = 1.0
     return largest
 
 
@@ -60,10 +60,10 @@ def expected_lines(bands: BandLevels, hops: float, modes: Sequence[tuple[float, 
     Each mode is a natural frequency, Hz, and a damping ratio.
     """
     bins = _bins(bands, hops)
-    parts, bin_hz = np.maximum(_of_noise(bins), _OTHERS), np.diff(bands.edges_hz) / bins
+    parts, bin_hz = np.maximum(_noise_share(bins), _OTHER_MODES_SHARE), np.diff(bands.edges_hz) / bins
     for natural_hz, damping in modes:
-        near = (bands.edges_hz[1:] > natural_hz / _MOVED) & (bands.edges_hz[:-1] < natural_hz * _MOVED)
-        of_mode = _of_noise(np.maximum(np.pi * damping * natural_hz / bin_hz, 1.0))  # of its noise bandwidth, bins
+        near = (bands.edges_hz[1:] > natural_hz / _MODE_SHIFT) & (bands.edges_hz[:-1] < natural_hz * _MODE_SHIFT)
+        of_mode = _noise_share(np.maximum(np.pi * damping * natural_hz / bin_hz, 1.0))  # of its noise bandwidth, bins
         most = np.where(of_mode < _LIKE_A_LINE, np.minimum(_SCATTERS * of_mode, _MODE), 1.0)
         parts[near] = np.maximum(parts, most)[near]
     return parts
@@ -74,7 +74,7 @@ def _bins(bands: BandLevels, hops: float) -> FloatArray:
     return np.asarray(np.maximum(bands.freedom / (2 * hops), 1.0), dtype=np.float64)
 
 
-def _of_noise(bins: FloatArray) -> FloatArray:
+def _noise_share(bins: FloatArray) -> FloatArray:
     """Mean share of the power of noise that the strongest of `bins` independent bins has."""
     return np.asarray((np.log(bins) + np.euler_gamma) / bins, dtype=np.float64)
 
@@ -120,7 +120,7 @@ def new_line(
     share = np.divide(power, total, out=np.zeros(parts.shape), where=new & (total > 0))
     band, column = divmod(int(share.argmax()), share.shape[1])
     part, (low_hz, high_hz) = min(1.0, float(share[band, column])), bands.edges_hz[band : band + 2].tolist()
-    if part < _LOUD:
+    if part < _LEAST_SHARE:
         return ""
     times = without = ""
     if turning_hz:

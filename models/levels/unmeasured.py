@@ -9,7 +9,7 @@ from models.levels.settings import LevelSettings
 from models.mistakes import did_you_mean
 from models.signals.channels import Channel, Quantity
 
-_OF = {
+_QUANTITIES = {
     "velocity": (Quantity.ACCELERATION,),
     "high": (Quantity.ACCELERATION,),
     "envelope": (Quantity.ACCELERATION,),
@@ -39,7 +39,7 @@ def unmeasured(
 
 def _missing(plan: LevelPlan, column: int, measure: str, *, turning: bool) -> str | None:
     """Why a channel has no such level; None if it has."""
-    wanted = _OF.get(measure, ())
+    wanted = _QUANTITIES.get(measure, ())
     if wanted and plan.quantities[column] not in wanted:
         return f": it is a {plan.quantities[column].value}, expected {' or '.join(one.value for one in wanted)}"
     if measure in {"high", "envelope"} and plan.high_hz is None:

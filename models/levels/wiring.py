@@ -17,8 +17,8 @@ from rotorwatch.records.windows import SensorFault
 
 _NEWEST = (3, 6)  # numbers of newest hops that are compared before the whole window
 _FEWEST_PLACES = 3
-_OFF, _SURE = 0.15, 3.0  # tolerance: this part of the expected vector plus so many standard errors
-_CLEARLY = 2.0  # least distance from the healthy vector, in tolerances, of a channel that is called wrong
+_TOLERANCE_PART, _TOLERANCE_ERRORS = 0.15, 3.0  # this part of the expected vector plus so many standard errors
+_LEAST_DISTANCE = 2.0  # least distance from the healthy vector, in tolerances, of a channel that is called wrong
 _MOST_ERROR = 0.12  # largest standard error, as a part of the healthy vector
 _MEDIAN_STEP = 1.1774  # median length of a hop-to-hop step over the standard deviation of a hop's vector
 
@@ -45,14 +45,14 @@ def rewired(vectors: _ComplexArray, healthy: _ComplexArray, channels: Sequence[C
         error, now = scatter / np.sqrt(hops), vectors[-hops:].mean(axis=0)
         if not np.all(error < _MOST_ERROR * np.abs(healthy)):
             continue
-        turned = np.abs(now + healthy) < _OFF * np.abs(healthy) + _SURE * error
+        turned = np.abs(now + healthy) < _TOLERANCE_PART * np.abs(healthy) + _TOLERANCE_ERRORS * error
         found = []
         for wrong, shown, sign in _mistakes(list(places.values()), turned, channels):
             expected = healthy.copy()
             expected[wrong] = sign * healthy[shown]
-            tolerance = _OFF * np.abs(expected) + _SURE * error
+            tolerance = _TOLERANCE_PART * np.abs(expected) + _TOLERANCE_ERRORS * error
             off, moved = np.abs(now - expected) / tolerance, np.abs(expected - healthy) / tolerance
-            if off.max() < 1 and moved[wrong].min() > _CLEARLY:
+            if off.max() < 1 and moved[wrong].min() > _LEAST_DISTANCE:
                 found.append((float(off.max()), wrong, sign))
         if found:
             _, wrong, sign = min(found)
