@@ -24,10 +24,10 @@ LEAST_DELAY_S, LEAST_DELAY_CHANGE_S = 1e-4, 3e-5
 # 1.1 Hz. At 1 Hz no parameter of machines of 15 to 40 Hz was taken for changed, at 2 Hz damping read up to 16 % more.
 MOST_LEAD_RAD_S = 7.0
 # The faulty channel's own change must match the disagreement within this part of it, and the other's stay below it.
-_ALIKE = 1 / 3
+_MATCH_TOLERANCE = 1 / 3
 _SAME_SPEED = 0.01
-_TOGETHER = 0.5  # coherence of bearing and disc across the planes, and how much less it must be within them
-_SURE = 0.2  # largest standard error of a channel's own change, as part of the disagreement, that may name a sensor
+_LEAST_COHERENCE = 0.5  # coherence of bearing and disc across the planes, and how much less it must be within them
+_MOST_ERROR = 0.2  # largest standard error of a channel's own change, as part of the disagreement, to name a sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def gain_and_delay(
         if steady or moving or departure.reversed:
             findings.append(_gain(window, departure, departures, naming, reference, moving=moving and not steady))
         if not departure.known and abs(departure.reading.lead_rad_s) > MOST_LEAD_RAD_S:
-            findings.append(_ahead(window, departure.reading, bands[departure.reading.pair], naming))
+            findings.append(_lead(window, departure.reading, bands[departure.reading.pair], naming))
         elif late:
             findings.append(_delay(window, departure, departures, naming, rate_hz))
     return _once(findings)
@@ -177,7 +177,7 @@ def _delay(
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=late, z=departure.delay_z)
 
 
-def _ahead(window: WindowStatistics, reading: PairReading, bands: Banded, naming: Naming) -> SensorFault:
+def _lead(window: WindowStatistics, reading: PairReading, bands: Banded, naming: Naming) -> SensorFault:
     """Finding on a sensor that leads as behind a high-pass; its value is the lead in s, weighted with the power."""
     pair, power = reading.pair, bands.spectra[:, 1, 1].real
     guilty, other = (pair.second, pair.first) if reading.lead_rad_s > 0 else (pair.first, pair.second)
@@ -207,9 +207,9 @@ def _by_chain(
             mine, his = departure.course_step, theirs.course_step
         else:
             mine, his = departure.log_gain, theirs.log_gain
-        if abs(his) < _ALIKE * abs(mine):
+        if abs(his) < _MATCH_TOLERANCE * abs(mine):
             return pair.first if middle == pair.second else pair.second
-        if abs(his + mine) < _ALIKE * abs(mine):
+        if abs(his + mine) < _MATCH_TOLERANCE * abs(mine):
             return middle
     return None
 
@@ -230,9 +230,9 @@ def _by_level(window: WindowStatistics, departure: _Departure, reference: Sensor
         changes.append(float(np.log(seen / known.rotation)))
         then = known.rotation_spread / np.sqrt(reference.n_hops)
         errors.append(float(np.hypot(sizes.std() / seen / np.sqrt(sizes.size), then)))
-    if max(errors) > _SURE * abs(departure.log_gain):
+    if max(errors) > _MOST_ERROR * abs(departure.log_gain):
         return None
-    return _one_of(departure, changes, departure.log_gain)
+    return _explaining_channel(departure, changes, departure.log_gain)
 
 
 def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
@@ -250,21 +250,21 @@ def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
     vectors = window.rotation_vectors
     if vectors is not None and not window.removed_by_hop:  # the amplitude depends on the speed
         levels.append(np.log(np.maximum(np.abs(vectors[:, columns]), tiny)))
-    best, least = None, _SURE
+    best, least = None, _MOST_ERROR
     for level in levels:
         slopes = course @ level / power
         left = level - level.mean(axis=0) - np.outer(course, slopes)
         error = float(np.sqrt((left**2).sum(axis=0).min() / max(1, course.size - 2) / power))
         if error < least:
             best, least = [float(slope) for slope in slopes], error
-    return None if best is None else _one_of(departure, best, 1.0)
+    return None if best is None else _explaining_channel(departure, best, 1.0)
 
 
-def _one_of(departure: _Departure, changes: list[float], size: float) -> int | None:
+def _explaining_channel(departure: _Departure, changes: list[float], size: float) -> int | None:
     first, second = changes
-    if abs(first) < _ALIKE * abs(size) and abs(second - size) < _ALIKE * abs(size):
+    if abs(first) < _MATCH_TOLERANCE * abs(size) and abs(second - size) < _MATCH_TOLERANCE * abs(size):
         return departure.reading.pair.second
-    if abs(second) < _ALIKE * abs(size) and abs(first + size) < _ALIKE * abs(size):
+    if abs(second) < _MATCH_TOLERANCE * abs(size) and abs(first + size) < _MATCH_TOLERANCE * abs(size):
         return departure.reading.pair.first
     return None
 
@@ -280,12 +280,12 @@ def _once(findings: list[SensorFault]) -> list[SensorFault]:
 BROKEN = 0.9  # two sensors of one motion that share less than this do not see the same motion
 _SUSPECT = 0.985  # below this, channels may be swapped: two places of a stiff shaft move much alike
 _RESTORED = 0.97  # least part that both pairs must share after the exchange, over the healthy part
-_CLEARLY = 5.0  # factor by which the exchange must reduce the part that the worse pair does not share
+_LEAST_IMPROVEMENT = 5.0  # factor by which the exchange must reduce the part that the worse pair does not share
 # 1x amplitudes of exchanged channels: largest difference from each other's healthy ones over that from their own.
 _CROSSED = 0.25
 
 
-def _usual(reference: SensorReference | None, first: str, second: str) -> float:
+def _healthy_shared(reference: SensorReference | None, first: str, second: str) -> float:
     known = None if reference is None else reference.pair(first, second)
     return 1.0 if known is None else known.same
 
@@ -297,7 +297,7 @@ def suspect_pairs(
     return [
         pair
         for pair, own in bands.items()
-        if same(own) < _SUSPECT * _usual(reference, states[pair.first], states[pair.second])
+        if same(own) < _SUSPECT * _healthy_shared(reference, states[pair.first], states[pair.second])
     ]
 
 
@@ -313,12 +313,12 @@ def swapped(
         crossed = (MotionPair(one.first, other.second, one.order), MotionPair(other.first, one.second, one.order))
         now = min(same(banded(window, pair)) for pair in (one, other))
         then = min(same(banded(window, pair)) for pair in crossed)
-        usual = min(_usual(reference, window.states[p.first], window.states[p.second]) for p in (one, other))
-        if then < _RESTORED * min(usual, 1.0) or 1 - now < _CLEARLY * (1 - then):
+        usual = min(_healthy_shared(reference, window.states[p.first], window.states[p.second]) for p in (one, other))
+        if then < _RESTORED * min(usual, 1.0) or 1 - now < _LEAST_IMPROVEMENT * (1 - then):
             continue
         explained |= {one, other}
         sides = [(one.first, other.first), (one.second, other.second)]
-        guilty = _guilty(window, sides, broken, reference)
+        guilty = _exchanged_side(window, sides, broken, reference)
         columns = sides[guilty] if guilty is not None else (*sides[0], *sides[1])
         states = tuple(window.states[column] for column in columns)
         pairs = " and ".join(
@@ -354,7 +354,7 @@ def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault
         return float(np.mean(both / both.sum(axis=0), axis=1) @ coherence)
 
     within, crossed = max(shared("y1", "y2"), shared("z1", "z2")), min(shared("y1", "z2"), shared("z1", "y2"))
-    if crossed < _TOGETHER or within > _TOGETHER * crossed:
+    if crossed < _LEAST_COHERENCE or within > _LEAST_COHERENCE * crossed:
         return []
     states = tuple(window.states[column[name]] for name in ("y1", "z1", "y2", "z2"))
     text = (
@@ -364,7 +364,7 @@ def crossed_planes(window: WindowStatistics, naming: Naming) -> list[SensorFault
     return [SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=within)]
 
 
-def _guilty(
+def _exchanged_side(
     window: WindowStatistics, sides: list[tuple[int, int]], broken: list[MotionPair], reference: SensorReference | None
 ) -> int | None:
     """Side that was exchanged: its channels break two pairs each, or have each other's healthy 1x amplitudes."""

@@ -25,7 +25,7 @@ _DELAY_STEP_S = 2.5e-4
 _AS_GOOD = 0.98
 # The 1x vectors are rejected if they move gain or delay by more than so many standard errors: run-out falsifies them,
 # and so does cross-axis sensitivity, as the other plane's 1x comes a quarter turn later.
-_LINE_FITS = 5.0
+_MOST_LINE_ERRORS = 5.0
 _RUNOUT = 0.03  # least change of the log gain to reject them, and largest standard error without them
 _TOLD_APART = 2 * math.log(1e3)  # least fall of χ² with which a model of the phases is preferred: 1000 times likelier
 _MOST_ACROSS = 0.15  # largest cross-axis sensitivity that is corrected for: more has another cause
@@ -122,11 +122,11 @@ def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
 
 def same(bands: Banded) -> float:
     """Part of the motion that two sensors show with equal timing, size and sense; 1 if all, negative if opposed."""
-    z, v, cross = _even(bands)
+    z, v, cross = _powers_over_frequency(bands)
     return float(2 * cross.sum().real / (z + v)) if z > 0 and v > 0 else 0.0
 
 
-def _even(bands: Banded) -> tuple[float, float, ComplexArray]:
+def _powers_over_frequency(bands: Banded) -> tuple[float, float, ComplexArray]:
     """Powers of z and v, and cross-powers per band, over ω: amplifies neither's noise at an end of the band."""
     z, v = bands.total[:, 0, 0].real / bands.w, bands.total[:, 1, 1].real / bands.w
     return float(z.sum()), float(v.sum()), np.asarray(bands.total[:, 1, 0] / bands.w, dtype=np.complex128)
@@ -159,7 +159,7 @@ def read_pair(
         return None
     incoherent = np.maximum(1 - np.abs(bands.spectra[:, 1, 0]) ** 2 / (z * v), _FLOOR)
     h, variance, bias = _transfer(bands, incoherent)
-    level, other, cross = _even(bands)
+    level, other, cross = _powers_over_frequency(bands)
     delay_s, total = _turned(bands.w, cross)
     polarity, log_gain = 1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR)))
     fitted = partial(_fitted, PairReading(pair, log_gain, 0.0, polarity, delay_s, 0.0, 0.0, 0.0))
@@ -173,14 +173,14 @@ def read_pair(
     if lead_rad_s:
         h = h * np.exp(-1j * lead_rad_s / bands.w)
         alone = fitted(bands.w, h, variance, bias)
-    line = None if bands.rotation is None else _line(bands.rotation, window, bands, incoherent)
+    line = None if bands.rotation is None else _transfer_at_1x(bands.rotation, window, bands, incoherent)
     if line is None:
         return replace(alone, lead_rad_s=lead_rad_s, shared=shared)
     speed, ratio, spread = line
     ratio *= complex(np.exp(-1j * lead_rad_s / speed))
     found = fitted(np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0))
-    foreign = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
-    foreign |= abs(found.delay_s - alone.delay_s) > _LINE_FITS * alone.delay_error_s
+    foreign = abs(found.log_gain - alone.log_gain) > max(_MOST_LINE_ERRORS * alone.log_gain_error, _RUNOUT)
+    foreign |= abs(found.delay_s - alone.delay_s) > _MOST_LINE_ERRORS * alone.delay_error_s
     if foreign and alone.log_gain_error < _RUNOUT:
         found = alone
     return replace(found, lead_rad_s=lead_rad_s, shared=shared)
@@ -253,7 +253,7 @@ def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArr
     return lead_rad_s if as_delay - as_lead > _TOLD_APART * scatter else 0.0
 
 
-def _line(
+def _transfer_at_1x(
     rotation: tuple[float, ComplexArray], window: WindowStatistics, bands: Banded, incoherent: FloatArray
 ) -> tuple[float, complex, float] | None:
     """Speed, and transfer at 1x with its relative variance, from the 1x vectors; None if z has no 1x power."""

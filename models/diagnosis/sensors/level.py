@@ -38,7 +38,7 @@ DRIFT_PART = 3.0
 # The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages.
 MOVED_PART = 3.0
 _FEWEST_DROPPED = 3  # least number of hops with drop-outs for a finding; fewer do not affect the readings
-_TOGETHER = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
+_SHAFT_PART = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
 
 
 def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> list[SensorFault]:
@@ -189,20 +189,20 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
         z: float | None = step_z
         jumped = step_z > STEP_SPREADS and abs(steps[column]) > STEP_PART * own
         drifted = abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column])
-        if jumped and not _shaft(window.states, column, steps):
+        if jumped and not _shaft_moved(window.states, column, steps):
             value = float(steps[column])
             text = (
                 f"{name}: the mean jumped by {naming.value(state, value)} within the window ({abs(value) / own:.3g} "
                 f"times the channel's rms), expected a steady one: connector, supply or gap"
             )
-        elif drifted and not _shaft(window.states, column, drifts):
+        elif drifted and not _shaft_moved(window.states, column, drifts):
             value = float(drifts[column])
             z = abs(value) / float(spread[column])
             text = (
                 f"{name}: the mean drifted by {naming.value(state, value)} within the window, the limit is "
                 f"{DRIFT_PART:g} times the channel's rms ({naming.value(state, DRIFT_PART * own)})"
             )
-        elif abs(moved[column]) > floor[column] and not _shaft(window.states, column, moved):
+        elif abs(moved[column]) > floor[column] and not _shaft_moved(window.states, column, moved):
             value, z = float(moved[column]), None
             text = (
                 f"{name}: the mean stands {naming.value(state, value)} from where it was on the healthy machine, "
@@ -245,18 +245,18 @@ def _largest_step(means: FloatArray) -> FloatArray:
     return np.asarray(across[np.abs(across).argmax(axis=0), np.arange(means.shape[1])], dtype=np.float64)
 
 
-def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
+def _shaft_moved(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     """Whether a displacement's mean changed together with another displacement's, as when the shaft moves."""
     places = [
         i for i, name in enumerate(states) if name in ("y1", "y2", "z1", "z2") or re.fullmatch(r"\w+@[\d.]+", name)
     ]
     if column not in places:
         return False
-    return any(abs(changes[i]) > _TOGETHER * abs(changes[column]) for i in places if i != column)
+    return any(abs(changes[i]) > _SHAFT_PART * abs(changes[column]) for i in places if i != column)
 
 
 MOST_ERRORS = 6.0  # standard errors that a jump must exceed, tested at the most probable of all moments
-_STAY = 3.0  # standard errors within which all else must be unchanged
+_STAY_ERRORS = 3.0  # standard errors within which all else must be unchanged
 LEAST_JUMP = 0.08
 _FEWEST_SIDE = 3
 
@@ -281,10 +281,10 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
         others = [i for i in range(n) if i != column]
         value = float(np.expm1(jumps[column]))
         z = float(abs(jumps[column]) / errors[column])
-        alone = np.all(np.abs(jumps[others]) < np.maximum(_STAY * errors[others], abs(jumps[column]) / 4))
-        quiet = np.all(np.abs(levels[others]) < np.maximum(_STAY * level_errors[others], abs(jumps[column]) / 4))
-        straight = abs(turns[column]) < _STAY * turn_errors[column]
-        along = abs(levels[column] - jumps[column]) < _STAY * level_errors[column]
+        alone = np.all(np.abs(jumps[others]) < np.maximum(_STAY_ERRORS * errors[others], abs(jumps[column]) / 4))
+        quiet = np.all(np.abs(levels[others]) < np.maximum(_STAY_ERRORS * level_errors[others], abs(jumps[column]) / 4))
+        straight = abs(turns[column]) < _STAY_ERRORS * turn_errors[column]
+        along = abs(levels[column] - jumps[column]) < _STAY_ERRORS * level_errors[column]
         if z > MOST_ERRORS and abs(value) > LEAST_JUMP and alone and quiet and straight and along:
             state = window.states[column]
             why = "expected a change of the machine to show in more than one channel: its gain jumped"

@@ -52,8 +52,8 @@ _MAINS_OFF_HZ = 0.2  # largest deviation of the mains frequency (EN 50160 allows
 _FEWEST = 4  # least number of channels needed to see that one of them rose alone
 # Calibrated standard deviations of the logarithm of a healthy pair's rise, and of that of a healthy channel's floor.
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
-_CLEAR = 0.5  # one of two sensors is the noisy one if its noise exceeds the other's by more than this part of both
-_SURE = 0.15
+_LEAST_PART = 0.5  # one of two sensors is the noisy one if its noise exceeds the other's by more than this part of both
+_MOST_SHARE_ERROR = 0.15
 _COUNTS = 2.0  # bands in which the noise rose by a smaller factor do not contribute to its rms
 
 
@@ -158,7 +158,7 @@ def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -
     weight = 1 / variance
     share = float(weight @ (v - z) / (weight @ both))
     error = float(1 / np.sqrt(weight.sum()) / (weight @ both / weight.sum()))
-    if error > _SURE or abs(share) < _CLEAR:
+    if error > _MOST_SHARE_ERROR or abs(share) < _LEAST_PART:
         return None
     return reading.pair.second if share > 0 else reading.pair.first
 

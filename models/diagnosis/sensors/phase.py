@@ -41,7 +41,7 @@ _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _CLOCK_HOPS = 8  # number of newest hops in which a clock is found that has only just begun to run at another rate
 LEAST_CLOCK_RAD = 0.1  # least turn from hop to hop of sensors on a clock of their own: 130 ppm at 24 Hz and 5 s
 _ALIKE = 0.25
-_STAY, _SURE, _ALMOST = 3.0, 4.0, 0.8
+_MOST_Z, _LEAST_Z, _NEAR_BEST_PART = 3.0, 4.0, 0.8
 _LENGTH = 0.15  # largest relative change of the vectors' common length that counts as unchanged
 _LINE_BINS, _AROUND_BINS, _FEWEST_AROUND, _AROUND_HZ = 1, 12, 4, 6.0
 _LINE_STRENGTH = 15.0  # least factor by which the power of a line exceeds its surroundings, mean over the channels
@@ -60,7 +60,7 @@ def phase_faults(
     if window.speed_source != "phase reference" or vectors is None or not columns or not abs(speed) > 0:
         return []
     name = naming.name("theta")
-    found = _lost(window, name) or _elsewhere(window, columns, name, reference)
+    found = _missing_turns(window, name) or _line_at_other_speed(window, columns, name, reference)
     if found is None and len(vectors) >= _FEWEST_HOPS:
         if not window.removed_by_hop:
             scaled, course = _common(columns, vectors)
@@ -94,7 +94,7 @@ def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> 
     return SensorFault(states=("theta",), kind=kind, text=text, value=value, z=z)
 
 
-def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
+def _missing_turns(window: WindowStatistics, name: str) -> SensorFault | None:
     """Finding on whole turns missing from or added to single hops of an otherwise steady shaft."""
     hops = len(window.waveforms)
     if hops < _FEWEST_HOPS:
@@ -141,7 +141,7 @@ def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
     return at if 2 * _LINE_BINS < at < f.size - 2 * _LINE_BINS else None
 
 
-def _elsewhere(
+def _line_at_other_speed(
     window: WindowStatistics, columns: Sequence[int], name: str, reference: SensorReference | None
 ) -> SensorFault | None:
     """Finding on a healthy 1x that is missing at the angle's speed and appears at another one."""
@@ -225,9 +225,9 @@ def _clock(
         surest = int((np.abs(rates) / errors).argmax())
         rate, z = float(rates[surest]), float(np.abs(rates[surest]) / errors[surest])
         turning = np.abs(rates - rate) < np.abs(rates)
-        apart = np.abs(np.where(turning, rates - rate, rates)) > np.maximum(_STAY * errors, _ALIKE * abs(rate))
+        apart = np.abs(np.where(turning, rates - rate, rates)) > np.maximum(_MOST_Z * errors, _ALIKE * abs(rate))
         lengths = np.abs(own[:, turning])
-        if abs(rate) < LEAST_CLOCK_RAD or z < MOST_ERRORS or np.any(apart) or np.any(_SURE * errors > abs(rate)):
+        if abs(rate) < LEAST_CLOCK_RAD or z < MOST_ERRORS or np.any(apart) or np.any(_LEAST_Z * errors > abs(rate)):
             continue
         if np.any(lengths.std(axis=0) > _ALIKE * lengths.mean(axis=0)):
             continue
@@ -258,11 +258,11 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
         return None
     # The hop that straddles the jump has an angle in between or, for half a turn, only a shorter vector.
     longer = np.array([_longer(course, k) for k in range(1, len(z) + 1)])
-    at = 1 + int(np.where(z > _ALMOST * best, longer, np.inf).argmin())
+    at = 1 + int(np.where(z > _NEAR_BEST_PART * best, longer, np.inf).argmin())
     change, error = turns[at - 1]
     value = float(change[0])
     own = window.hop_jump_rad[max(1, at - 2) : at + 2]
-    seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_STAY * float(error[0]), _ALIKE * abs(value))
+    seen = np.abs(np.angle(np.exp(1j * (own + value)))) < max(_MOST_Z * float(error[0]), _ALIKE * abs(value))
     lengths = np.abs(np.delete(course, [0, at - 1, at]))
     steady = lengths.std() < _LENGTH * lengths.mean()  # not where a bow grows through the unbalance to the other side
     half = steady and best > MOST_ERRORS and np.pi - abs(value) < _HALF_RAD
@@ -271,11 +271,11 @@ def _jump(window: WindowStatistics, vectors: ComplexArray, course: ComplexArray,
     elif best < MOST_ERRORS or not (half or np.isnan(own).any()):
         return None
     own_turns, errors = _turn(vectors, at)
-    together = np.abs(np.angle(np.exp(1j * (own_turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
-    clear = _STAY * errors < abs(value) / 2
+    together = np.abs(np.angle(np.exp(1j * (own_turns - value)))) < np.maximum(_MOST_Z * errors, _ALIKE * abs(value))
+    clear = _MOST_Z * errors < abs(value) / 2
     known = seen.any() or 2 * clear.sum() >= clear.size
     # The first hop may itself be astride half a turn: shorter, but not turned by another angle.
-    most = np.inf if half and at <= 2 else max(_LENGTH, _STAY * float(error[0]))
+    most = np.inf if half and at <= 2 else max(_LENGTH, _MOST_Z * float(error[0]))
     if abs(value) < LEAST_JUMP_RAD or longer[at - 1] > most or not np.all(together) or not known:
         return None
     if half and not seen.any():

@@ -57,13 +57,13 @@ class Naming:
 _FLAT = 2.0  # bands within this factor of the lowest lie on the floor
 _LINE_BINS, _BLOCK = 3, 24  # bins that hold a line in Hann segments, and bins of its surroundings
 _STANDS_OUT = 6.0  # a bin with this many times the median power of its surroundings may hold a line
-_OWN = 4.0  # the same factor for the conditional power, given the other channels
+_STANDS_OUT_ALONE = 4.0  # the same factor for the conditional power, given the other channels
 # Relative distance from a multiple of half the speed, in addition to the range of speed, within which a line is put
 # down to the shaft.
 _HARMONIC = 0.002
 _RIDGE = 1e-9
 _LEAKAGE = 1.0
-_LEFT = 0.1  # least part of the difference's power that counts as noise after leakage was subtracted
+_LEAST_NOISE_PART = 0.1  # least part of the difference's power that counts as noise after leakage was subtracted
 _SMOOTHED = 3
 
 
@@ -79,7 +79,7 @@ class PairNoise:
     @property
     def noise(self) -> FloatArray:
         """Power of the difference without the leakage."""
-        return np.maximum(self.density - self.leakage, _LEFT * self.density)
+        return np.maximum(self.density - self.leakage, _LEAST_NOISE_PART * self.density)
 
     @property
     def share(self) -> FloatArray:
@@ -195,7 +195,7 @@ def _lines(window: WindowStatistics, columns: Sequence[int]) -> dict[int, tuple[
         beside = near[np.abs(near - peak) > _LINE_BINS]
         both = np.stack([window.spectrum[peak - 1 : peak + 2].mean(axis=0), window.spectrum[beside].mean(axis=0)])
         on, off = _conditional(both)[:, column]
-        if on > _OWN * off:
+        if on > _STANDS_OUT_ALONE * off:
             found[column] = (float(np.sqrt(2 * (on - off) * _LINE_BINS * (f[1] - f[0]))), float(f[peak]))
     return found
 
