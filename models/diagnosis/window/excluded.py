@@ -23,7 +23,7 @@ _CHANCE = 1e-4  # for one bin that stands out
 _FEWEST_SEGMENTS = 6
 _ORDERS = range(2, 13)
 _MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # mains frequencies, and their relative tolerance
-_SAME = 0.02  # relative tolerance for the same line
+_LINE_TOLERANCE = 0.02  # relative tolerance for the same line
 _HUM = 0.05  # part of the random power up to which a line counts as hum; above, it is reported like any other
 _HALVES = (0.5, 1.5, 2.5)  # multiples of the speed that a rub or looseness causes
 
@@ -87,19 +87,19 @@ def excluded_lines(
     step_hz, speed_hz = frequencies_hz[1] - frequencies_hz[0], (slowest_hz + fastest_hz) / 2
     found = []
     try:
-        at = np.flatnonzero(_wanted(frequencies_hz, slowest_hz, fastest_hz, known))
+        at = np.flatnonzero(_bins_to_search(frequencies_hz, slowest_hz, fastest_hz, known))
         strength, motions = _outstanding(spectrum, at, (at, at))
         peaks = np.zeros(frequencies_hz.size + 2 * _LOBE)
         peaks[at + _LOBE] = strength
         highest = peaks[at + np.arange(2 * _LOBE + 1)[:, np.newaxis]].max(axis=0)
         healthy = _near_known(frequencies_hz, speed_hz, known)
-        hum = _wanted(frequencies_hz, slowest_hz, fastest_hz, ())
+        hum = _bins_to_search(frequencies_hz, slowest_hz, fastest_hz, ())
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
             own = segments[at[n]] @ motions[n]
-            if not _keeps_course(own):
+            if not _phase_is_steady(own):
                 continue
             line = ExcludedLine(float(frequencies_hz[at[n]]), step_hz * _skirt(strength[n]))
-            phases, centre_hz = _course(own, line, step_hz)
+            phases, centre_hz = _line_phases(own, line, step_hz)
             # If a multiple of the speed is in the same lobe, the phase says which of the two it is.
             is_hum = hum[at[n]] and _beside_multiples(centre_hz, slowest_hz, fastest_hz, step_hz / 2)
             if healthy[at[n]] or (is_hum and _share(segments, int(at[n]), own) <= _HUM):
@@ -110,12 +110,12 @@ def excluded_lines(
         for order in _ORDERS:
             half_hz = order * (fastest_hz - slowest_hz) / 2
             at = np.flatnonzero(np.abs(frequencies_hz - order * speed_hz) <= half_hz + step_hz)
-            had = known is not None and any(abs(one / order - 1) <= _SAME for _, one in known)
+            had = known is not None and any(abs(one / order - 1) <= _LINE_TOLERANCE for _, one in known)
             if at.size and (had or known is None):
                 strength, motions = _outstanding(spectrum, at, (at[:1], at[-1:]))
                 # All bins of a lobe have the phase in the middle of the segment, with a sign that alternates.
                 own = ((-1.0) ** at[:, np.newaxis] * (segments[at] @ motions[strength.argmax()])).sum(axis=0)
-                if had or (strength.max() > _STANDS_OUT and _goes_with(own, rotation, order)):
+                if had or (strength.max() > _STANDS_OUT and _phase_follows_rotation(own, rotation, order)):
                     line = ExcludedLine(order * speed_hz, half_hz + step_hz * _skirt(strength.max()))
                     found.append(
                         _with_power(line, segments, frequencies_hz, rotation**order, order * speed_hz, half_hz)
@@ -125,7 +125,7 @@ def excluded_lines(
     return tuple(found)
 
 
-def _wanted(
+def _bins_to_search(
     frequencies_hz: FloatArray, slowest_hz: float, fastest_hz: float, known: Sequence[KnownLine] | None
 ) -> npt.NDArray[np.bool_]:
     """Bins to search: where a known line or hum may be, without the rotation."""
@@ -154,7 +154,7 @@ def _near_known(
     near = np.full(frequencies_hz.size, known is None)
     for line_hz, order in known or ():
         for then in (line_hz, order * speed_hz):
-            near |= np.abs(frequencies_hz - then) <= _SAME * then
+            near |= np.abs(frequencies_hz - then) <= _LINE_TOLERANCE * then
     return near
 
 
@@ -169,7 +169,7 @@ def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
     return float((line - noise).sum() / (np.abs(segments) ** 2).mean(axis=1).sum())
 
 
-def _course(own: ComplexArray, line: ExcludedLine, step_hz: float) -> tuple[ComplexArray, float]:
+def _line_phases(own: ComplexArray, line: ExcludedLine, step_hz: float) -> tuple[ComplexArray, float]:
     """Phases of a line that advances by one angle per segment, shape (n_segments,), and its frequency.
 
     The phases may drift, but over more than a few segments: following every segment would follow a resonance as well.
@@ -231,28 +231,28 @@ def _skirt(strength: float) -> float:
     return float(max(_LOBE + 1, 2 * strength ** (1 / 6)))
 
 
-def _keeps_course(own: ComplexArray) -> bool:
+def _phase_is_steady(own: ComplexArray) -> bool:
     """Whether the phase of segments, shape (n_segments,), advances by the same angle each time, unlike that of noise.
 
     The frequency may be off the bin and drift slowly. For n segments of noise that overlap by half, the mean of unit
     vectors at the change of that angle has length u or more with about the probability (1 - u²)ⁿ⁻⁴.
     """
     unit = _unit(own)
-    return bool((1 - _length(unit[:-2] * unit[1:-1].conj() ** 2 * unit[2:]) ** 2) ** (own.size - 4) < _CHANCE)
+    return bool((1 - _mean_length(unit[:-2] * unit[1:-1].conj() ** 2 * unit[2:]) ** 2) ** (own.size - 4) < _CHANCE)
 
 
-def _goes_with(own: ComplexArray, rotation: ComplexArray, order: int) -> bool:
+def _phase_follows_rotation(own: ComplexArray, rotation: ComplexArray, order: int) -> bool:
     """Whether the phase of segments, shape (n_segments,), follows a multiple of the rotation.
 
     The mean of n unit vectors has length u or more with the probability (1 - u²)ⁿ⁻¹; the segments overlap, so every
     second one is evidence.
     """
-    return bool((1 - _length(_unit(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
+    return bool((1 - _mean_length(_unit(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
 
 
 def _unit(coefficients: ComplexArray) -> ComplexArray:
     return np.asarray(coefficients / np.maximum(np.abs(coefficients), np.finfo(float).tiny), dtype=np.complex128)
 
 
-def _length(unit: ComplexArray) -> float:
+def _mean_length(unit: ComplexArray) -> float:
     return min(1.0, float(abs(unit.mean())))

@@ -27,8 +27,8 @@ from models.diagnosis.window.moments import ComplexArray, HopMoments, Plan
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
-_STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; in between with little data
-_NO_BURST = 1.8
+_MOST_SPREAD = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between with little data
+_MOST_FAINT_SPREAD = 1.8
 """The same: 1.2 to 1.4 for a faint line, over 2.2 for what rings in a few segments and keeps its phase there."""
 _STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings, for a line seen in one window alone, and in two
 _NEIGHBOURHOOD_HZ = 4.0
@@ -38,7 +38,7 @@ _HARMONICS = 12
 _CHANCE = 1e-9
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
-_LOUD, _SAME = 0.02, 0.02
+_LOUD, _LINE_TOLERANCE = 0.02, 0.02
 """Part of a channel's random power above which a new line is reported, and relative tolerance for the same line."""
 
 
@@ -89,9 +89,9 @@ def steady_lines(
         if mean[at, column] < mean[lobe, column].max():
             continue
         spread = float((power[:, at, column] ** 2).mean() / mean[at, column] ** 2)
-        clear = mean[at, column] > _STANDS_OUT * floor[at, column] and spread < _STEADY
+        clear = mean[at, column] > _STANDS_OUT * floor[at, column] and spread < _MOST_SPREAD
         chance = _chance(segments[:, at, column])
-        likely = spread < _NO_BURST and chance < math.sqrt(_CHANCE)
+        likely = spread < _MOST_FAINT_SPREAD and chance < math.sqrt(_CHANCE)
         if clear or likely:
             share = min(1.0, float(2 * step_hz * mean[lobe, column].sum() / total[column]))
             certain = bool(clear and chance < _CHANCE)
@@ -148,7 +148,7 @@ def new_line(
     `beside` says whether `known` includes lines next to a multiple of the speed; if not, such lines are passed over.
     """
     told = (line for line in lines if line.certain and line.share > _LOUD and (beside or not line.beside))
-    return next((line for line in told if not _among(line, known, speed_rad_s)), None)
+    return next((line for line in told if not _is_known(line, known, speed_rad_s)), None)
 
 
 class LatestLines:
@@ -165,7 +165,7 @@ class LatestLines:
         before = [line for end_ns, line in self._seen if end_ns <= window.start_ns + length_ns // 100]
         self._seen += [(window.end_ns, line.known(window.speed_rad_s)) for line in lines if line.likely]
         return tuple(
-            replace(line, certain=True) if line.likely and _among(line, before, window.speed_rad_s) else line
+            replace(line, certain=True) if line.likely and _is_known(line, before, window.speed_rad_s) else line
             for line in lines
         )
 
@@ -187,10 +187,10 @@ class LatestLines:
         self._seen = [(end_ns, (hz, order)) for end_ns, (hz, order) in zip(ends, lines, strict=True)]
 
 
-def _among(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> bool:
+def _is_known(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> bool:
     """Whether a line is one of these, at its frequency or order."""
     own = line.known(speed_rad_s)
-    return any(abs(now - then) <= _SAME * then for one in known for now, then in zip(own, one, strict=True))
+    return any(abs(now - then) <= _LINE_TOLERANCE * then for one in known for now, then in zip(own, one, strict=True))
 
 
 def _chance(own: ComplexArray) -> float:

@@ -424,11 +424,11 @@ def hop_coefficients(
         for number in range(len(hops)):
             for k in range(per_hop):  # its middle lies k halves of a segment after the hop's beginning
                 part = k * (plan.segment // 2) / plan.hop - 0.5
-                segments[number * per_hop + k] = _between(hops, beta, number, part)
+                segments[number * per_hop + k] = _interpolated(hops, beta, number, part)
     return beta, segments
 
 
-def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: float) -> FloatArray:
+def _interpolated(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: float) -> FloatArray:
     """Coefficients at a part of a hop from its middle, on the line through an adjoining hop; its own without one."""
     for neighbour in (number + 1, number - 1) if part > 0 else (number - 1, number + 1):
         if 0 <= neighbour < len(hops) and _adjoin(hops[min(number, neighbour)], hops[max(number, neighbour)]):

@@ -22,10 +22,10 @@ _PADDING = 4
 _REFINEMENTS = 5
 # Largest relative difference of speed between neighbouring hops of one shaft, apart from its sweep: a lightly damped
 # resonance looks like a line, but its peak wanders by its width.
-_NEIGHBOUR = 0.004
+_MOST_SPEED_STEP = 0.004
 _RESOLVED = 0.25  # part of a hop's frequency resolution below which no difference is believed
 # Relative distance from the straight line through the speeds of most hops beyond which a peak is not the shaft's.
-_COURSE = 0.03
+_MOST_OFF_TREND = 0.03
 _FOLLOWED_PART = 0.8
 _FEW_HOPS = 6  # fewer hops need lines that stand out by themselves
 # Least number of hops in a row at one set point of a drive, and least part of a window that is in such rows.
@@ -136,19 +136,19 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     with np.errstate(invalid="ignore"):
         if len(lines) < _FEW_HOPS:
-            near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
+            near = np.abs(speed / np.median(speed) - 1) < _MOST_SPEED_STEP * len(lines)
             return speed if np.all(strength > STRONG) and np.all(near) else None
-        near = _near(speed, hop_s)
+        near = _largest_step(speed, hop_s)
         steps, swept = np.diff(speed), _swept(lines, hop_s)
         together = np.abs(steps - swept) < near[1:]
     followed = np.append(together, False) | np.insert(together, 0, False)
     if followed.sum() > 1:
         number = np.flatnonzero(followed)
-        followed[number] = np.abs(speed[number] / _course(speed, number)[number] - 1) < _COURSE
+        followed[number] = np.abs(speed[number] / _speed_trend(speed, number)[number] - 1) < _MOST_OFF_TREND
     if (number := np.flatnonzero(np.isfinite(speed))).size > 1:
         # In noise the error of a line's sweep exceeds the sweep of a steady shaft. Leaving a line in a window is worse
         # than removing one from noise, and the peaks of noise do not keep to a straight line.
-        steady = np.abs(speed - _course(speed, number)) < near
+        steady = np.abs(speed - _speed_trend(speed, number)) < near
         followed |= steady & (steady.mean() >= _FOLLOWED_PART)
     apart = ~(together | (np.abs(steps) < near[1:]))
     lengths = np.diff(np.flatnonzero(np.concatenate([[True], apart, [True]])))
@@ -170,7 +170,7 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     if usual <= STRONG:
         return np.full(found.shape, True)
     steps = np.diff(followed)
-    near = _near(followed, hop_s)[1:]
+    near = _largest_step(followed, hop_s)[1:]
     steady, held = np.abs(steps) < near, np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s))) < near
     # The first and the last hop have only one neighbour.
     level = steady & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
@@ -180,9 +180,9 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     return np.asarray(settled & np.append(held, True) & np.insert(held, 0, True), dtype=np.bool_)
 
 
-def _near(speed: FloatArray, hop_s: float) -> FloatArray:
+def _largest_step(speed: FloatArray, hop_s: float) -> FloatArray:
     """Largest difference of speed between neighbouring hops of one shaft, rad/s."""
-    return np.asarray(np.maximum(_NEIGHBOUR * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
+    return np.asarray(np.maximum(_MOST_SPEED_STEP * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
 
 
 def _swept(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray:
@@ -191,7 +191,7 @@ def _swept(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray:
     return np.asarray((sweep[1:] + sweep[:-1]) / 2 * hop_s, dtype=np.float64)
 
 
-def _course(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
+def _speed_trend(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
     """Robust straight line through the speeds of the hops `number`, evaluated at every hop."""
     slope, start = scipy.stats.theilslopes(speed[number], number)[:2]
     return np.asarray(start + slope * np.arange(speed.size), dtype=np.float64)

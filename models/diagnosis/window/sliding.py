@@ -96,13 +96,13 @@ class SlidingWindow:
         self._blocks.append((start_ns, samples.shape[0]))
         if self._pending_samples == samples.shape[0]:  # they may be samples to skip after a snapshot
             self._pending = self._pending[-1:]
-            self._leave(self._row)
+            self._drop_pending(self._row)
         while self._pending_samples >= self.plan.need:
             first_ns = self._pending_start_ns
             buffer = self._joined()
             block_ns, row = self._blocks[0][0], self._row
             self._pending, self._row = [buffer], self._row + self.plan.stride
-            self._leave(self.plan.stride)
+            self._drop_pending(self.plan.stride)
             yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
         if self._pending and self._pending[0].base is not None:  # a view would keep the whole buffer in memory
             self._pending[0] = self._pending[0].copy()
@@ -113,7 +113,7 @@ class SlidingWindow:
             return self._pending[0]
         return np.concatenate(self._pending or [np.empty((0, self._width), np.float32)])
 
-    def _leave(self, count: int) -> None:
+    def _drop_pending(self, count: int) -> None:
         """Drop the first `count` pending samples; those that have not come yet are dropped when they come."""
         if not count:
             return

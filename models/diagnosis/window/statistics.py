@@ -309,7 +309,7 @@ def window_statistics(
         if lagged
         else (),
     )
-    return _of_the_shaft(found, plan, by_bin, lost)
+    return _shaft_motion(found, plan, by_bin, lost)
 
 
 def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[HopMoments, ...], Rotation]:
@@ -319,12 +319,12 @@ def _settled(hops: tuple[HopMoments, ...], rotation: Rotation) -> tuple[tuple[Ho
     return tuple(hop for hop, there in zip(hops, kept, strict=True) if there), found
 
 
-def _of_the_shaft(
+def _shaft_motion(
     window: WindowStatistics, plan: Plan, by_bin: ComplexArray, lost: tuple[str, ...]
 ) -> WindowStatistics:
     """The window of the shaft's motion, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
     mounted = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
-    shaft = mounted if plan.runout is None else _without(mounted, plan.runout)
+    shaft = mounted if plan.runout is None else _without_runout(mounted, plan.runout)
     shaft = shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
     return replace(shaft.of(plan.states_without(lost)), lost=lost) if lost else shaft
 
@@ -351,7 +351,7 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
     )
 
 
-def _without(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:
+def _without_runout(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:
     """The window without run-out: what sensors show at running speed although nothing vibrates."""
     known = runout if window.speed_rad_s >= 0 else runout.conj()
     return replace(
