@@ -24,7 +24,7 @@ _LEAST_SUSPECT_Z = 5.0
 # Smallest change that is named: no sensor or machine file is more accurate, but with one source a tenth is significant.
 _LEAST_SUSPECT = 5e-3
 _SCATTER = 1e-4  # significance level at which the scatter of a score among healthy windows is more than chance
-_LINEAR = 0.5  # largest one-step estimate whose size is stated: beyond it, only "not small" is certain
+_MOST_STATED_CHANGE = 0.5  # largest one-step estimate whose size is stated: beyond it, only "not small" is certain
 _LEAST_DELAY_S, _LONGEST_DELAY_S = 2e-6, 1e-3  # the same two limits for delays
 # Least part of the excess that a single cause must account for to be named: in an unexplained window, and in any other.
 # Among delays, gains and masses, the right cause mostly accounted for at least a third, and always for a sixth if the
@@ -58,7 +58,7 @@ class AlternativeTest:
         if quantity == DELAY:
             least, most, size = _LEAST_DELAY_S, _LONGEST_DELAY_S, f"{1e6 * change:+.0f} µs"
         else:
-            least, most, size = _LEAST_SUSPECT, _LINEAR, f"{change:+.1%}"
+            least, most, size = _LEAST_SUSPECT, _MOST_STATED_CHANGE, f"{change:+.1%}"
         # An unequal shaft that gains in y loses as much in z.
         if abs(change) < least or impossible(-abs(change) if self.name == UNEQUAL else change, quantity):
             return ""

@@ -37,7 +37,7 @@ def beyond(value: float, limit: float) -> tuple[str, str]:
     return text, f"{limit:g}"
 
 
-_GAIN = 0.15  # relative error of every vector due to the sensors and the model's approximation of the rotor
+_VECTOR_ERROR = 0.15  # relative error of every vector due to the sensors and the model's approximation of the rotor
 _RATE = 1e-6  # probability that the vectors of an unbalance are taken for foreign
 
 
@@ -52,7 +52,7 @@ def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatA
         return ""
     size = np.maximum(np.hypot(observed[:n], observed[n:]), np.hypot(explained[:n], explained[n:]))
     left = observed - explained
-    allowed = spread + np.diag(np.tile((_GAIN * size) ** 2 / 2, 2))
+    allowed = spread + np.diag(np.tile((_VECTOR_ERROR * size) ** 2 / 2, 2))
     chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chdtri(2 * n - 2, _RATE))
     if chi2 <= most:
         return ""
@@ -60,7 +60,7 @@ def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatA
     return f"its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluation limit {limit}"
 
 
-_SEEN = 3.0  # standard errors from which a vector has a direction
+_DIRECTION_ERRORS = 3.0  # standard errors from which a vector has a direction
 # Least movement of the heavy spot that counts as turned, in standard errors and as part of the unbalance: angle sensors
 # and probes are not mounted more accurately than to a few degrees.
 _TURNED, _LEAST_TURN = 6.0, 0.05
@@ -173,7 +173,7 @@ class UnbalanceVector:
         return math.sqrt(max(along, 0.0))
 
     def _angle(self, x: float, y: float) -> float | None:
-        seen = math.hypot(x, y) > _SEEN * max(self._error(x, y), self._error(-y, x))
+        seen = math.hypot(x, y) > _DIRECTION_ERRORS * max(self._error(x, y), self._error(-y, x))
         return math.degrees(math.atan2(y, x)) if seen else None
 
 

@@ -105,10 +105,10 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         window = window.as_mounted
         own_rate = self._own_rate(rate)
         limit = -float(ndtri(own_rate))
-        common = self._unlike(window)
+        common = self._not_comparable(window)
         return tuple(self._judged(one, window, common, own_rate, limit) for one in self.channels)
 
-    def _unlike(self, window: WindowStatistics) -> str:
+    def _not_comparable(self, window: WindowStatistics) -> str:
         """Why no channel of the window can be compared; empty if they can."""
         lags = np.array(self.lags_s)
         if window.lags_s.shape != lags.shape or np.any(np.abs(window.lags_s - lags) > _LAG_TOLERANCE_S):

@@ -170,15 +170,15 @@ class BaselineDiagnostician:
                 through = np.vstack([through, e.slope])
         same = self._as_commissioned(changes)
         if not same:
-            least = _OTHER_FORCE if self._alone else 1.0
+            least = _OTHER_FORCE if self._one_condition else 1.0
             alone = one_source(window)
             own = [self._own_of[name] for name in names[: values.size]]
             wider = np.array([max(least if one.terms else 1.0, one.one_source if alone else 1.0) for one in own])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
-        elsewhere = through @ np.diag(self._elsewhere(bearing.values, same=same)) @ through.T
+        elsewhere = through @ np.diag(self._other_condition_variances(bearing.values, same=same)) @ through.T
         # A stiffness that grew with the motion has really changed, so the unbalance is read with it and gets no part of
         # this variance. Under the commissioned force, growth that commissioning did not show is not assumed.
-        seen, unseen = self._grown(changes)
+        seen, unseen = self._growth_variances(changes)
         elsewhere[range(seen.size), range(seen.size)] += seen if same else seen + unseen
         total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
@@ -206,13 +206,13 @@ class BaselineDiagnostician:
             return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), unexplained=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
         if suspicion is None:
-            abstains = self._alone and not same
+            abstains = self._one_condition and not same
             return replace(diagnosis, unexplained=_unexplained(diagnosis.misfit_z)) if abstains else diagnosis
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
     @property
-    def _alone(self) -> bool:
+    def _one_condition(self) -> bool:
         """Whether the relations were tested in one condition only; False for records from before growth was learned."""
         return self._conditions == 1 and bool(self._baseline.growth)
 
@@ -224,13 +224,13 @@ class BaselineDiagnostician:
         now = force_spectrum([one.moments.of for one in seen], [one.combination for one in seen])
         return alike(self._baseline.force, now)
 
-    def _elsewhere(self, changes: FloatArray, *, same: bool) -> FloatArray:
+    def _other_condition_variances(self, changes: FloatArray, *, same: bool) -> FloatArray:
         """Variances from the relations' errors in other conditions, over the number of conditions learned from."""
         own = [self._own_of[name] for name in self._names]
         errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
         return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
 
-    def _grown(self, changes: Sequence[RowChange | None]) -> tuple[FloatArray, FloatArray]:
+    def _growth_variances(self, changes: Sequence[RowChange | None]) -> tuple[FloatArray, FloatArray]:
         """Variances of stiffnesses at another power of motion: from growth that was seen, and from growth unseen."""
         found = np.zeros((2, len(self._names)))
         known = zip(self._rows, self._own, self._baseline.relations, self._baseline.growth, changes, strict=False)

@@ -17,7 +17,7 @@ _BAND_HZ = 8.0
 # Largest distance at which two forces count as the same. On finite-element rotors (overhung, between bearings; seeds
 # 100 to 105, windows of 30 s) the same force is 0.0005 to 0.019 from itself with changes of up to c -40 %, up to 0.038
 # with k -25 %; forces of the same colour and level in other directions 0.044 to 0.97, one window in ten below 0.09.
-_ALIKE = 0.03
+_MOST_DISTANCE = 0.03
 
 
 def force_spectrum(windows: Sequence[RowWindow], combinations: Sequence[FloatArray]) -> FloatArray:
@@ -48,7 +48,7 @@ def alike(healthy: FloatArray, now: FloatArray) -> bool:
     root = np.sqrt(power)
     A, B = (_hermitian(one) / root[:, :, None] / root[:, None, :] for one in (healthy, now))
     sizes = np.linalg.norm(A), np.linalg.norm(B)
-    return bool(np.linalg.norm(A - B) ** 2 < 2 * _ALIKE * sizes[0] * sizes[1])
+    return bool(np.linalg.norm(A - B) ** 2 < 2 * _MOST_DISTANCE * sizes[0] * sizes[1])
 
 
 def _hermitian(packed: FloatArray) -> ComplexArray:

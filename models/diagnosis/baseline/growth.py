@@ -18,7 +18,7 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-_CHANCE = 4.0  # squared ratio of growth to its standard error up to which growth is taken for chance
+_MOST_CHANCE_RATIO = 4.0  # squared ratio of growth to its standard error up to which growth is taken for chance
 # Largest hidden growth assumed where the power of the motion is e times as large or as small, or beyond; if smaller,
 # the standard error of the growth is used. Every stiffness carries half a per cent in any case (`rows.py`).
 _UNSEEN, _CARRIED = 0.02, 0.005
@@ -37,7 +37,7 @@ class Growth:
 
         A stiffness that falls as the motion grows is taken for chance.
         """
-        seen = max(0.0, self.slope**2 - _CHANCE * self.standard_error**2) if self.slope > 0 else 0.0
+        seen = max(0.0, self.slope**2 - _MOST_CHANCE_RATIO * self.standard_error**2) if self.slope > 0 else 0.0
         return seen * (power / self.power - 1) ** 2
 
     def unseen_variance(self, power: float) -> float:

@@ -330,7 +330,7 @@ _FAR = 3.0  # largest distance of a coefficient from its expected value, in expe
 _VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
 _LEFT_OVER = 5.0  # largest χ² per degree of freedom with one condition; several are compared with each other instead
 _DISAGREE = 4.0  # standard errors beyond which conditions disagree
-_RECORD = (
+_ADVICE = (
     "make sure that the sensors of bearing and disc are not exchanged, that none has the wrong sign, and that all are "
     "sampled at once and AC-coupled alike (or state delay_us and high_pass_hz), or record a second condition: another "
     "speed, another load, or more broadband excitation at the bearing"
@@ -347,7 +347,7 @@ def undetermined(baseline: Baseline) -> tuple[str, ...]:
     found, alone = [], len({one.condition for one in baseline.consistency}) < 2
     for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True):
         reason = "" if relation is None else _reason(row, relation, alone=alone)
-        found.append(f"{row.title}: {reason}; {_RECORD}" if reason else "")
+        found.append(f"{row.title}: {reason}; {_ADVICE}" if reason else "")
     return tuple(found)
 
 

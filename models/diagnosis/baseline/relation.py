@@ -75,7 +75,7 @@ def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatA
     return total
 
 
-_MEMORY = 1.1
+_MEMORY_PERIODS = 1.1
 _CUTOFFS_HZ = np.geomspace(10.0, 300.0, 40)
 _NOISES = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 25)])
 _LOWEST_RAISED_HZ = 8.0
@@ -98,7 +98,7 @@ def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
     logarithm, inverse_model = _models(f.tobytes())
     cost = logarithm + np.log(inverse_model @ density / f.size)
     cutoff_hz = _CUTOFFS_HZ[int(np.argmin(cost)) // _NOISES.size]
-    return scale * float(np.clip(_MEMORY / cutoff_hz, SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S))
+    return scale * float(np.clip(_MEMORY_PERIODS / cutoff_hz, SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S))
 
 
 def one_source(window: WindowStatistics) -> bool:

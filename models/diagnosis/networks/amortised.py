@@ -152,7 +152,7 @@ class NetworkDiagnostician:
         They are those of the second reading, unless a parameter is too uncertain in the first or out of range in
         either; then those of the first.
         """
-        first, near = _stated(self._amortised.networks, inputs), self._amortised.near
+        first, near = _outputs(self._amortised.networks, inputs), self._amortised.near
         if near is None:
             return first
         centre, own = np.zeros(len(PARAMETERS)), {name: [PARAMETERS.index(one) for one in OWN[name]] for name in first}
@@ -164,7 +164,7 @@ class NetworkDiagnostician:
             centre[own[equation]] = mean
         features = self._features.around(around(self._machine, centre))
         again, _ = self._standardised(window, near.basis, features, centre[None].astype(np.float32))
-        remainder = _stated(near.networks, again)
+        remainder = _outputs(near.networks, again)
         if not all(np.all(np.abs(mean) <= trained[own[name]]) for name, (mean, _) in remainder.items()):
             return first
         return {name: (centre[own[name]] + mean, factor) for name, (mean, factor) in remainder.items()}
@@ -247,7 +247,7 @@ class NetworkDiagnostician:
         return Diagnosis(self.by, tuple(no_reading(name, self.by, reason) for name in names))
 
 
-def _stated(networks: tuple[AmortisedNetwork, ...], inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
+def _outputs(networks: tuple[AmortisedNetwork, ...], inputs: Float32Array) -> dict[str, tuple[FloatArray, FloatArray]]:
     found: dict[str, tuple[FloatArray, FloatArray]] = {}
     for network in networks:
         n_inputs = network.direct.shape[0]

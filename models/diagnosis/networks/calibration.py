@@ -82,7 +82,7 @@ def _relation_errors(groups: Sequence[FloatArray]) -> tuple[float, float, float,
     """
     freedom = min(min((_fitted(group, one)[0], one) for one in _RELATION_FREEDOMS)[1] for group in groups)
     _, scale, floor, gain = _fitted(np.concatenate(groups, axis=1), freedom)
-    wider = _wider(freedom) / gain
+    wider = _t_factor(freedom) / gain
     return scale * wider, floor * wider, gain, freedom
 
 
@@ -109,7 +109,7 @@ def _t_logpdf(x: FloatArray, freedom: float) -> FloatArray:
     return np.asarray(constant - (freedom + 1) / 2 * np.log1p(x * x / freedom), dtype=np.float64)
 
 
-def _wider(freedom: float) -> float:
+def _t_factor(freedom: float) -> float:
     """Factor on the scale of a t distribution with which ±1.96 scales contain 95 %."""
     return float(stdtrit(freedom, 0.975)) / Z95
 
@@ -166,5 +166,5 @@ def _calibration(pairs: FloatArray) -> Calibration:
         scales.append(float(np.mean(np.quantile(z[own], _QUANTILES) / ndtri((1 + np.array(_QUANTILES)) / 2))))
     scaled = z / np.interp(np.log(deviation), knots, scales)
     # Only the shape is fitted: for any degrees of freedom, ±1.96 standard errors contain 95 %.
-    freedom = max(_FREEDOMS, key=lambda n: float(np.sum(_t_logpdf(scaled * _wider(n), n) + np.log(_wider(n)))))
+    freedom = max(_FREEDOMS, key=lambda n: float(np.sum(_t_logpdf(scaled * _t_factor(n), n) + np.log(_t_factor(n)))))
     return Calibration(bias=bias, log_deviation=tuple(knots), z_scale=tuple(scales), freedom=freedom)

@@ -48,7 +48,7 @@ class ForceFeatures:
         index = np.array([STATE_INDEX[name] for name in self.states])
         self._dofs = sorted(set(index % 6))
         self._pairs = tuple((i, j) for i in range(len(self._dofs)) for j in range(i))
-        self._twice = tuple(
+        self._measured_twice = tuple(
             (self.states.index(name), self.states.index(f"{name}_dot"))
             for name in self.states
             if f"{name}_dot" in self.states
@@ -85,7 +85,7 @@ class ForceFeatures:
     @property
     def n_consistency(self) -> int:
         """Number of features from `consistency`."""
-        return 1 + 2 * _BANDS * len(self._twice)
+        return 1 + 2 * _BANDS * len(self._measured_twice)
 
     def _corners(self) -> FloatArray:
         """Corner ω above which rates replace displacements, for each measured degree of freedom, rad/s.
@@ -161,8 +161,8 @@ class ForceFeatures:
         speed = np.where(np.isfinite(speed_rad_s), speed_rad_s / self._machine.operation.speed_rad_s - 1, 0.0)
         parts = [speed[:, None]]
         w = 2 * np.pi * self.frequencies_hz
-        if self._twice:
-            x, v = (list(side) for side in zip(*self._twice, strict=True))
+        if self._measured_twice:
+            x, v = (list(side) for side in zip(*self._measured_twice, strict=True))
             powers = spectrum[:, :, x, x].real * w[:, None] ** 2, spectrum[:, :, v, v].real
             s_x, s_v = (np.add.reduceat(power, self._bands, axis=1) for power in powers)
             s_xv = np.add.reduceat(spectrum[:, :, x, v] * w[:, None], self._bands, axis=1)
@@ -176,10 +176,10 @@ class ForceFeatures:
         It is taken from `consistency` in the band in which they agree best: sensor noise makes them differ in some
         bands, a wrong gain in all of them.
         """
-        n = len(self._twice)
+        n = len(self._measured_twice)
         ratio = consistency[:, 1 : 1 + _BANDS * n].reshape(-1, _BANDS, n)
         best = np.abs(np.expm1(ratio / 2)).min(axis=1)
-        return {self.states[x]: best[:, k].astype(np.float64) for k, (x, _) in enumerate(self._twice)}
+        return {self.states[x]: best[:, k].astype(np.float64) for k, (x, _) in enumerate(self._measured_twice)}
 
     def unbalance(
         self,

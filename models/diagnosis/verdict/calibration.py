@@ -14,7 +14,7 @@ from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Agreement, Detectable, Parameter
 
 MONTH_S = 30 * 86400.0  # the month of "false alarms per month", s
-_FURTHER = 0.25  # share of the rate at which a parameter is wrongly added to one that is known to have changed
+_FURTHER_PART = 0.25  # share of the rate at which a parameter is wrongly added to one that is known to have changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,12 @@ class Thresholds:
     outside: float  # for the over-identification test (one-sided), which has the declared rate to itself
 
 
-def _upper(probability: float) -> float:
+def _upper_quantile(probability: float) -> float:
     """Point that a standard normal exceeds with this probability."""
     return -float(ndtri(probability))
 
 
-def _shared(probability: float, tests: int) -> float:
+def _rate_per_test(probability: float, tests: int) -> float:
     """Probability for each of several tests that keeps `probability` for all of them (Šidák)."""
     return -math.expm1(math.log1p(-probability) / tests)
 
@@ -48,9 +48,9 @@ def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
         raise ValueError(f"rate is {rate} for {n_parameters} parameters, expected 0 < rate < 1 and at least one")
     others = max(1, n_parameters - 1)
     return Thresholds(
-        first=_upper(_shared(rate, n_parameters) / 2),
-        further=_upper(_shared(_FURTHER * rate, others) / 2),
-        outside=_upper(rate),
+        first=_upper_quantile(_rate_per_test(rate, n_parameters) / 2),
+        further=_upper_quantile(_rate_per_test(_FURTHER_PART * rate, others) / 2),
+        outside=_upper_quantile(rate),
     )
 
 
@@ -102,14 +102,14 @@ def month_thresholds(
     per_hop = per_month * hop_s / MONTH_S / n_stretches
     others = max(1, n_parameters - 1)
     return Thresholds(
-        first=_crossed(per_hop / (2 * n_parameters), overlap),
-        further=_crossed(_FURTHER * per_hop / (2 * others), overlap),
-        outside=_crossed(per_hop * n_stretches, overlap),
+        first=_crossing_threshold(per_hop / (2 * n_parameters), overlap),
+        further=_crossing_threshold(_FURTHER_PART * per_hop / (2 * others), overlap),
+        outside=_crossing_threshold(per_hop * n_stretches, overlap),
     )
 
 
 @lru_cache(maxsize=256)
-def _crossed(per_hop: float, overlap: int) -> float:
+def _crossing_threshold(per_hop: float, overlap: int) -> float:
     """Threshold with this crossing rate; never below one standard error, where crossings are as frequent as can be."""
     low, high = 1.0, 37.0
     if crossing_rate(low, overlap) <= per_hop:
@@ -120,7 +120,7 @@ def _crossed(per_hop: float, overlap: int) -> float:
 
 
 # Probability that two diagnosticians who are both right are said to disagree in a window, about any parameter.
-_RATE = 1e-3
+_DISAGREEMENT_RATE = 1e-3
 
 
 def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
@@ -131,7 +131,7 @@ def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
     one, other = ({reading.name: reading for reading in diagnosis.evaluable} for diagnosis in (first, second))
     between = (first.by, second.by)
     common = sum(name in one and name in other for name in PARAMETERS)
-    threshold = window_thresholds(_RATE, max(1, common)).first
+    threshold = window_thresholds(_DISAGREEMENT_RATE, max(1, common)).first
     found = []
     for name in PARAMETERS:
         if name in one and name in other:
@@ -161,7 +161,7 @@ def _difference_z(one: Parameter, other: Parameter, freedom: tuple[float, float]
     if uncertain == 0:
         return z
     tail = float(stdtr(variance**2 / uncertain, -abs(difference) / math.sqrt(variance)))
-    return math.copysign(_upper(tail), difference) if tail > 0 else z
+    return math.copysign(_upper_quantile(tail), difference) if tail > 0 else z
 
 
 def _scale(freedom: float) -> float:
@@ -174,12 +174,12 @@ def widened(diagnosis: Diagnosis, rate: float) -> Diagnosis:
     if not diagnosis.freedom:
         return diagnosis
     readings = diagnosis.evaluable
-    tail = _shared(rate, max(1, len(readings))) / 2
+    tail = _rate_per_test(rate, max(1, len(readings))) / 2
     wider = np.ones(len(readings))
     for position, reading in enumerate(readings):
         freedom = diagnosis.freedom.get(reading.name, math.inf)
         if freedom < math.inf:
-            wider[position] = -float(stdtrit(freedom, tail)) * _scale(freedom) / _upper(tail)
+            wider[position] = -float(stdtrit(freedom, tail)) * _scale(freedom) / _upper_quantile(tail)
     return replace(diagnosis, covariance=diagnosis.full_covariance * np.outer(wider, wider))
 
 
@@ -189,7 +189,7 @@ def beside(first: Diagnosis, second: Diagnosis) -> Diagnosis:
     Equation (29) reads the unbalance assuming an unchanged shaft: a changed shaft looks to it like an unbalance.
     """
     read = {reading.name: reading for reading in first.evaluable}
-    changed = {name for name, one in read.items() if abs(one.z or 0.0) > window_thresholds(_RATE, 1).first}
+    changed = {name for name, one in read.items() if abs(one.z or 0.0) > window_thresholds(_DISAGREEMENT_RATE, 1).first}
     parameters = []
     for one in second.parameters:
         shifts = {

@@ -24,14 +24,14 @@ from models.signals.block import FloatArray
 _STEPS, _MOST_STEPS = 2, 20  # moments that are tried in every hop, at least and at most
 _APART = 2.0  # standard errors by which a window's reading may differ from one of these moments to the next
 # Weight of a second of the new state relative to one of the old state: their ratio of vibration power.
-_POWERS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+_POWER_RATIOS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
 # Independent variance of each window over a window's variance: its maximum is followed to a fraction of an error.
-_FOLLOWED = 0.1
-_BENT = 0.1  # difference between the reading of a mixture and the mixture of the readings, over the change
-_SIZE = 0.3  # standard deviation of possible changes, in the scale of the errors
-_HELD = 0.002  # the same of a parameter before it changes for the first time
+_OWN_VARIANCE = 0.1
+_MIXTURE_ERROR = 0.1  # difference between the reading of a mixture and the mixture of the readings, over the change
+_CHANGE_SPREAD = 0.3  # standard deviation of possible changes, in the scale of the errors
+_UNCHANGED_SPREAD = 0.002  # the same of a parameter before it changes for the first time
 _ODDS = 0.1  # odds that a further parameter has changed, once one has
-_BEFORE = 100.0  # odds of a change before data that have just begun
+_EARLIER_ODDS = 100.0  # odds of a change before data that have just begun
 _MOST = 2  # further parameters that are tried
 _QUANTILES = (0.5, 0.025, 0.975)
 
@@ -60,13 +60,13 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     seen = values @ whiten.T
     steps, coarse = _resolution(seen)
     whiten, seen = whiten / coarse, seen / coarse
-    bent = _BENT**2 * float(np.sum((seen[-1] - seen[0]) ** 2)) + 1e-12
+    bent = _MIXTURE_ERROR**2 * float(np.sum((seen[-1] - seen[0]) ** 2)) + 1e-12
     starts, ends = (np.array([getattr(one, at) for one in windows], dtype=np.float64) for at in ("start_ns", "end_ns"))
     # The first one stands for all before the data. It is as probable as the others together, and much more so where
     # the data have only just begun: few machines change in their first minute.
     moments = np.append(starts[0] - hop_ns, np.arange(starts[0], min(by_ns, ends[-1]), hop_ns / steps))
     watched = ends[0] <= starts[-1] + hop_ns / 2
-    odds = max(1, moments.size - 1) * (1.0 if watched else _BEFORE)
+    odds = max(1, moments.size - 1) * (1.0 if watched else _EARLIER_ODDS)
     before = np.log(np.where(moments < starts[0], odds, 1.0))
     length = np.min(ends - starts)
     # Gaps are taken out of the time: a gap enters with a window that ends late and leaves with one that starts late.
@@ -75,9 +75,9 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     order = np.argsort(times)
     ends, changed = ends - gone, moments - np.interp(moments, times[order], gaps[order])
     overlap = np.clip((length - np.abs(ends[:, None] - ends)) / length, 0.0, 1.0)
-    decorrelate = np.linalg.inv(np.linalg.cholesky(overlap + _FOLLOWED * np.eye(ends.size)))
+    decorrelate = np.linalg.inv(np.linalg.cholesky(overlap + _OWN_VARIANCE * np.eye(ends.size)))
     share = np.clip((ends - changed[:, None]) / length, 0.0, 1.0)
-    part = _POWERS[:, None, None] * share
+    part = _POWER_RATIOS[:, None, None] * share
     part /= part + 1 - share  # (n_powers, n_moments, n_windows)
     design = decorrelate @ np.stack([1 - part, part, 4 * part * (1 - part)], axis=-1)
     gram, right = (np.swapaxes(design, -1, -2) @ side for side in (design, decorrelate @ seen))
@@ -92,8 +92,8 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
         gain = back @ np.swapaxes(basis, -1, -2) @ whiten
         common, errors = (np.sum(gain @ side * gain, axis=-1) for side in (shared, own))
         unit = np.mean(np.sum(back**2, axis=-1), axis=-1)
-        spread = np.stack([_HELD**2 + np.mean(common, axis=-1), np.full(unit.size, _SIZE**2)])
-        prior = np.stack(np.broadcast_arrays(unit / spread, unit / _SIZE**2, 1 / bent), axis=-1)
+        spread = np.stack([_UNCHANGED_SPREAD**2 + np.mean(common, axis=-1), np.full(unit.size, _CHANGE_SPREAD**2)])
+        prior = np.stack(np.broadcast_arrays(unit / spread, unit / _CHANGE_SPREAD**2, 1 / bent), axis=-1)
         fit, best, variance = _fitted(gram, right[:, :, None] @ basis, prior[:, None, None])
         weights.append(before[:, None] + fit + count * np.log(_ODDS))
         means.append((best[..., None, :] @ np.swapaxes(back, -1, -2))[..., 0, : len(first)])

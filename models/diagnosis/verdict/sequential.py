@@ -41,7 +41,7 @@ _CONTRADICTION_RATE = 1e-7
 _PROBABLE = 0.05  # least probability with which a parameter is reported as one that may have changed
 # Least distance from zero, in standard errors, of a reading astride its change; a smaller one says more about the date
 # of the change than about its size, and tends to be too large.
-_CLEAR = 3.0
+_LEAST_ASTRIDE_ERRORS = 3.0
 # Misfit, in standard deviations, below which a short stretch ends the verdict that the machine is outside the model.
 _INSIDE = 2.0
 _EITHER = "; or all sensors of a place have a wrong gain, which explains the data as well"
@@ -183,7 +183,7 @@ class SequentialTest:
             outside, confidence = model_test(clean[deciding[-1]], self._thresholds[deciding[-1]])
         unexplained = clean[deciding[-1]].unexplained if deciding else ""
         by = clean[deciding[-1]] if deciding else None
-        outside = self._outside(outside or bool(unexplained), by, own[window_hops])
+        outside = self._is_outside(outside or bool(unexplained), by, own[window_hops])
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
@@ -192,7 +192,7 @@ class SequentialTest:
             isolation = replace(isolation, changed=(), readings=())
         else:
             self._note(isolation.changed, every, clean, verdicts)
-        current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
+        current = self._current_readings(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
         either = foreign and not outside and findings != () and {one.name for one in findings} <= set(rivals)
@@ -241,7 +241,7 @@ class SequentialTest:
             found[windows] = total
         return found
 
-    def _outside(self, said: bool, by: Stretch | None, window: Stretch) -> bool:
+    def _is_outside(self, said: bool, by: Stretch | None, window: Stretch) -> bool:
         """Whether the machine counts as outside the model.
 
         `said` is the verdict of `by`, the longest clean stretch of a window at most, if there is one. While the window
@@ -279,7 +279,7 @@ class SequentialTest:
             if hops > self.settings.window_hops:
                 return
             explained = short.known and not short.unexplained and not model_test(short, self._thresholds[hops])[0]
-            worst = _worst(values[at], values[at + 1 :])
+            worst = _differences(values[at], values[at + 1 :])
             for (_, longer), whole, differs in zip(clean[:at:-1], values[:at:-1], worst[::-1], strict=True):
                 if differs > self._contradiction or (explained and longer.unexplained):
                     inside = hops < self.settings.window_hops
@@ -344,7 +344,7 @@ class SequentialTest:
     ) -> None:
         """Keep when each changed parameter was first found; forget findings that no longer hold."""
         known = {one.name: one for one in self.state.findings}
-        found = {name: known[name] for name in known if name in changed or self._still(name, clean)}
+        found = {name: known[name] for name in known if name in changed or self._still_holds(name, clean)}
         for name in changed:
             if name not in known:
                 by = [every[hops] for hops, verdict in verdicts.items() if name in verdict.changed]
@@ -354,7 +354,7 @@ class SequentialTest:
                 found[name] = finding(name, look.start_ns, look.end_ns, look.duration_s)
         self.state.findings = tuple(found[name] for name in PARAMETERS if name in found)
 
-    def _still(self, name: str, clean: Mapping[int, Stretch]) -> bool:
+    def _still_holds(self, name: str, clean: Mapping[int, Stretch]) -> bool:
         """Whether an earlier finding still holds: there is no whole clean window yet, and the clean data agree."""
         if self.settings.window_hops in clean:
             return False
@@ -364,7 +364,7 @@ class SequentialTest:
         values, variances = _values(clean[max(clean)])
         return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
 
-    def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
+    def _current_readings(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
         """Free readings of a stretch; those of changed parameters are means over what else may have changed."""
         values, covariance = look.estimate()
         errors = np.sqrt(np.diag(covariance)).tolist()
@@ -381,7 +381,7 @@ class SequentialTest:
             found = read_changes([look], named, hop_ns, look.start_ns)
         for at, i in enumerate(named):
             value, error = float(found.values[at]), float(found.errors[at])
-            if inside and abs(value) < _CLEAR * error:
+            if inside and abs(value) < _LEAST_ASTRIDE_ERRORS * error:
                 del read[PARAMETERS[i]]
             else:
                 read[PARAMETERS[i]] = value, error
@@ -439,7 +439,7 @@ def _clock(time_ns: int) -> str:
     return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S}"
 
 
-def _worst(part: tuple[FloatArray, FloatArray], wholes: Sequence[tuple[FloatArray, FloatArray]]) -> list[float]:
+def _differences(part: tuple[FloatArray, FloatArray], wholes: Sequence[tuple[FloatArray, FloatArray]]) -> list[float]:
     """Largest difference of a stretch from each that contains it, in standard errors of the difference.
 
     The variance of the difference between a part and the whole is the difference of their variances (Hausman), but at

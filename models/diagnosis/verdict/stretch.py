@@ -28,7 +28,7 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
-_LINEAR = frozenset({"e"})
+_LINEAR_PARAMETERS = frozenset({"e"})
 _MOST_LOSS = -0.95  # a parameter that reads as lost altogether has no logarithm
 # Least share of the total variance that is a window's own: its covariance and the shared one are both estimates.
 _LEAST_OWN = 1e-4
@@ -36,17 +36,17 @@ _LEAST_OWN = 1e-4
 
 def to_scale(name: str, change: float) -> float:
     """Relative change in the scale of its errors: ln(1 + change), or the change itself for e."""
-    return change if name in _LINEAR else math.log1p(max(change, _MOST_LOSS))
+    return change if name in _LINEAR_PARAMETERS else math.log1p(max(change, _MOST_LOSS))
 
 
 def from_scale(name: str, value: float) -> float:
     """Relative change from a value in the scale of its errors."""
-    return value if name in _LINEAR else math.expm1(value)
+    return value if name in _LINEAR_PARAMETERS else math.expm1(value)
 
 
 def slope(name: str, value: float) -> float:
     """Standard error of the relative change over that in the scale of the errors."""
-    return 1.0 if name in _LINEAR else math.exp(value)
+    return 1.0 if name in _LINEAR_PARAMETERS else math.exp(value)
 
 
 @dataclass(frozen=True, eq=False)  # without slots, as properties are cached
