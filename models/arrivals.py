@@ -106,7 +106,7 @@ class Arrivals:
             return (arrived,)
         # Another run, or a count that began anew: the missing blocks of the old one are given up.
         gone_on = self.flush()
-        known = 0 if block.run == self._run else self._known(block.run)
+        known = 0 if block.run == self._run else self._next_sequence(block.run)
         self._run = block.run
         self._next = known if known <= block.sequence <= known + self._bound else block.sequence
         return gone_on + self._place(arrived)
@@ -138,7 +138,7 @@ class Arrivals:
             return True
         return any(course.covers(block) for course in self._earlier)
 
-    def _known(self, run: int) -> int:
+    def _next_sequence(self, run: int) -> int:
         """Next sequence in a run that was left for another one; 0 if the run is new."""
         courses = (*self._earlier, *(() if self._course is None else (self._course,)))
         return max((course.sequence for course in courses if course.run == run), default=0)
@@ -191,8 +191,8 @@ def _same(one: Arrived, other: Arrived) -> bool:
 
 
 _REMEMBERED = 256
-_AHEAD = 64  # most blocks by which a publisher may jump ahead and still be taken for the same one
-_MOST = 8
+_MOST_AHEAD = 64  # most blocks by which a publisher may jump ahead and still be taken for the same one
+_MOST_SENDERS = 8
 # How often each of two publishers must have gone on after the other: blocks out of order cannot amount to as much.
 _RETURNS = 6
 _HORIZON_S = 300.0  # length of the data, from all publishers together, in which these are counted
@@ -226,7 +226,7 @@ class Senders:
     """
 
     def __init__(self) -> None:
-        self._senders: deque[_Sender] = deque(maxlen=_MOST)
+        self._senders: deque[_Sender] = deque(maxlen=_MOST_SENDERS)
         self._latest: _Sender | None = None
         self._heard_s = 0.0
         self._seen: dict[tuple[int, int], tuple[int, int, bytes]] = {}
@@ -280,7 +280,7 @@ class Senders:
     def _follow(self, block: SampleBlock) -> None:
         """Find the publisher that goes on with this block, and note after which other one it does."""
         for sender in self._senders:
-            if sender.run == block.run and -_REMEMBERED <= block.sequence - sender.highest <= _AHEAD:
+            if sender.run == block.run and -_REMEMBERED <= block.sequence - sender.highest <= _MOST_AHEAD:
                 break
         else:
             sender = _Sender(block.run, block.sequence)

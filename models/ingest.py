@@ -138,7 +138,7 @@ class Gate:
         self._candidate: Course | None = None
         self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
         self._refused: deque[Course] = deque(maxlen=EARLIER_COURSES)
-        self._had: list[Course] = []
+        self._before_restart: list[Course] = []
 
     @property
     def courses(self) -> tuple[Course, ...]:
@@ -151,16 +151,16 @@ class Gate:
 
     def begin(self) -> None:
         """Mark all courses known so far as received before a restart, see `had`."""
-        self._had = [*self.courses]
+        self._before_restart = [*self.courses]
 
     def had(self, block: SampleBlock) -> bool:
         """Whether a block that was received before a restart comes again for the first time.
 
         A publisher's cache sends each block once more when it is asked. Further repetitions are refused.
         """
-        for number, course in enumerate(self._had):
+        for number, course in enumerate(self._before_restart):
             if course.covers(block):
-                self._had[number] = replace(course, first=block.sequence + 1, first_ns=block.end_ns)
+                self._before_restart[number] = replace(course, first=block.sequence + 1, first_ns=block.end_ns)
                 return True
         return False
 
@@ -351,7 +351,7 @@ class Gate:
             or block.sequence != candidate.sequence
             or abs(block.start_ns - candidate.start_ns) > self._tolerance_ns
         ):
-            self._disbelieve()
+            self._refuse_candidate()
             candidate = Course.beginning(block)
         else:
             candidate = candidate.extended(block)
@@ -362,7 +362,7 @@ class Gate:
         step_s = 0.0 if previous is None else (block.start_ns - previous.start_ns) / 1e9
         new_run = candidate.run not in {course.run for course in self.courses}
         self._candidate = None
-        self._go_on(candidate)
+        self._change_course(candidate)
         if new_run:
             text = (
                 f"the publisher restarted, {lasting(abs(step_s))} {'earlier' if step_s < 0 else 'later'} in data time"
@@ -376,16 +376,16 @@ class Gate:
         if expected is not None and block.run == expected.run and block.sequence >= expected.sequence:
             self._expected = expected.extended(block)
         else:
-            self._go_on(Course.beginning(block))
-        self._disbelieve()
+            self._change_course(Course.beginning(block))
+        self._refuse_candidate()
 
-    def _disbelieve(self) -> None:
+    def _refuse_candidate(self) -> None:
         """Give up the course that the clock might have been set to."""
         if self._candidate is not None:
             self._refused.append(self._candidate)
             self._candidate = None
 
-    def _go_on(self, course: Course) -> None:
+    def _change_course(self, course: Course) -> None:
         """Follow another course than before."""
         if self._expected is not None:
             self._earlier.append(self._expected)

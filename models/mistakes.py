@@ -56,7 +56,7 @@ def read_toml(path: Path) -> dict[str, object]:
         If it cannot be read or is not TOML; the message names the file and, where known, the line.
     """
     try:
-        with open(path, "rb", opener=_at_once) as file:
+        with open(path, "rb", opener=_open_without_waiting) as file:
             data = file.read()
     except FileNotFoundError as error:
         beside = [entry.name for entry in path.parent.glob("*.toml")]
@@ -73,7 +73,7 @@ def read_toml(path: Path) -> dict[str, object]:
     return parse_toml(text, path)
 
 
-def _at_once(path: str, flags: int) -> int:
+def _open_without_waiting(path: str, flags: int) -> int:
     """Open a file, also a named pipe, without waiting for somebody who writes into it."""
     descriptor = os.open(path, flags | os.O_NONBLOCK)
     os.set_blocking(descriptor, True)  # a pipe into which somebody writes is read to its end

@@ -245,7 +245,7 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
     if len(alone) < len(windows):
         return told(verdict="passed", text="several independent forces excite the machine")
-    if not _alike([windows[name] for name in alone]):
+    if not _share_source([windows[name] for name in alone]):
         text = f"a single source excites everything in each of {len(alone)} recordings; together they can tell more"
         return told(verdict="passed", text=text)
     where = "in the only recording" if len(alone) == 1 else f"in the same way in all {len(alone)} recordings"
@@ -258,7 +258,7 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     )
 
 
-def _alike(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
+def _share_source(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
     """Whether recordings with one source each share it: all at one speed, and their mean spectrum shows one source."""
     speeds = [window.speed_rad_s for own in recordings for window in own if np.isfinite(window.speed_rad_s)]
     if speeds and max(speeds) > (1 + SAME_SPEED) * min(speeds):

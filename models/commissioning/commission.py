@@ -380,7 +380,7 @@ def _report(
             "level": knowledge.level,
             "level_text": knowledge.text,
             "verdict": verdict,
-            "summary": _summary(verdict, checks, _told(machine, [one.name for one in parameters if one.evaluable])),
+            "summary": _summary(verdict, checks, _readable(machine, [one.name for one in parameters if one.evaluable])),
             "version": 0 if commissioned is None else commissioned.version,
             "identity": None if commissioned is None else commissioned.identity,
             "healthy_s": healthy_s,
@@ -427,7 +427,7 @@ def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[G
     return tuple(alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops))
 
 
-def _told(machine: MachineFile, evaluable: Sequence[str]) -> str:
+def _readable(machine: MachineFile, evaluable: Sequence[str]) -> str:
     if evaluable:
         return f"changes of {', '.join(evaluable)} can be read"
     return "it can only be told whether a channel has changed" if states_of(machine) else "only levels are compared"

@@ -142,7 +142,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     if check.verdict == "refused":
         check = check.model_copy(
             update={
-                "advice": _elsewhere(machine, [each for _, _, each in read])
+                "advice": _turned_unbalance_advice(machine, [each for _, _, each in read])
                 or "the file does not describe the machine that was recorded: correct it, or leave "
                 "out of [rotor] what is not known for certain, so that it is identified"
             }
@@ -150,7 +150,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     return Learned((check,), read, read, found.machine, record, sense, notes=_integrated(pieces, machine))
 
 
-def _elsewhere(machine: Machine, read: Sequence[Diagnosis]) -> str:
+def _turned_unbalance_advice(machine: Machine, read: Sequence[Diagnosis]) -> str:
     """Advice if the unbalance is as large as in the file but at another angle; empty otherwise."""
     vectors = [each.unbalance for each in read if each.unbalance is not None and not each.unbalance.foreign]
     turned = [complex(one.real, one.imaginary) for one in vectors if one.turned and abs(one.magnitude_change) < _SIZE]
@@ -240,7 +240,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
             stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
-        compared += _halves(group, baseline.rows)
+        compared += _read_across_halves(group, baseline.rows)
     halves = check_agreement(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     sources = check_sources(
@@ -353,7 +353,7 @@ def _without_equations(
     return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)
 
 
-def _halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
+def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
     """Every window, read against a baseline learned on the other halves of the recordings."""
     found: list[Read] = []
     for late in (False, True):

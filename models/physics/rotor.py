@@ -203,7 +203,7 @@ def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     return A
 
 
-_LEAST = -1.0  # a quantity that is positive by nature cannot lose all of its value
+_LEAST_CHANGE = -1.0  # a quantity that is positive by nature cannot lose all of its value
 
 
 def impossible(change: float, quantity: str) -> str:
@@ -216,7 +216,7 @@ def impossible(change: float, quantity: str) -> str:
     >>> impossible(-4.7, "mass")
     'reads as −470 %, which is impossible: a mass cannot fall by 100 % or more'
     """
-    if change > _LEAST:
+    if change > _LEAST_CHANGE:
         return ""
     size = f"{-100 * change:.0f}"
     return f"reads as −{size} %, which is impossible: a {quantity} cannot fall by 100 % or more"

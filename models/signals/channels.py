@@ -53,7 +53,7 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
     (Quantity.SHAFT_ANGLE, "shaft", "rotation"): "theta",
 }
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
-_ELSEWHERE = ("DE", "NDE", "casing")
+_OTHER_LOCATIONS = ("DE", "NDE", "casing")
 """Names of other places, which are never taken for a misspelt location of the model."""
 LEAST_APART_DEG = 30.0
 """Least angle between two sensors that are resolved into y and z: at less, the result would be mostly their noise."""
@@ -115,13 +115,13 @@ class Channel(BaseModel, extra="forbid", frozen=True):
             return self
         known = self.location in _LOCATIONS
         hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
-        hint = "" if self.location in _ELSEWHERE else hint
+        hint = "" if self.location in _OTHER_LOCATIONS else hint
         if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
                 "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z, "
                 "or two at an angle, each with angle_deg; "
-                f"at places with other names ({', '.join(_ELSEWHERE)}, …) only levels are watched{hint}"
+                f"at places with other names ({', '.join(_OTHER_LOCATIONS)}, …) only levels are watched{hint}"
             )
         return self
 

@@ -88,8 +88,8 @@ def _topics(*keys: str) -> tuple[str, ...]:
     return tuple(key.removeprefix(_MODEL.root) for key in keys)
 
 
-_SENT = _topics(_MODEL.stream, _MODEL.descriptor, _MODEL.truth)
-_FOUND = _topics(_MODEL.report, _MODEL.health, _MODEL.alarm_event, _MODEL.alarm_state)
+_DATA = _topics(_MODEL.stream, _MODEL.descriptor, _MODEL.truth)
+_RESULTS = _topics(_MODEL.report, _MODEL.health, _MODEL.alarm_event, _MODEL.alarm_state)
 _HEALTH = _topics(_MODEL.health)
 _PUBLISHER_ALIVE = _topics(_MODEL.publisher_alive)
 _MONITOR_ALIVE = _topics(_MODEL.monitor_alive)
@@ -130,7 +130,7 @@ class Grant(BaseModel, extra="forbid", frozen=True):
     )
 
     @model_validator(mode="after")
-    def _something(self) -> Self:
+    def _check_not_empty(self) -> Self:
         if not (self.publishes or self.views or self.monitors):
             raise ValueError("the grant allows nothing: expected publishes, views or monitors")
         return self
@@ -168,31 +168,31 @@ def _rules(grant: Grant) -> list[tuple[_Flow, tuple[str, ...], list[str]]]:
     rules: list[tuple[_Flow, tuple[str, ...], list[str]]] = []
     if publishes:
         rules += [
-            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(publishes, _SENT)),
-            ("ingress", ("liveliness_token",), _at(publishes, _PUBLISHER_ALIVE) + _recovery(publishes, _SENT, "pub")),
+            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(publishes, _DATA)),
+            ("ingress", ("liveliness_token",), _at(publishes, _PUBLISHER_ALIVE) + _recovery(publishes, _DATA, "pub")),
             # An answer to this says that a monitor has received what was sent before it.
             ("ingress", ("query",), _at(publishes, _HEALTH)),
             ("egress", ("reply",), _at(publishes, _HEALTH)),
         ]
     if views:
         rules += [
-            ("ingress", _LISTENED, _with_recovery(views, _FOUND)),
-            ("egress", ("put", "reply", "declare_queryable"), _with_recovery(views, _FOUND)),
-            ("ingress", _LIVELINESS, _at(views, _ALIVE) + _recovery(views, _FOUND)),
-            ("egress", ("liveliness_token",), _at(views, _ALIVE) + _recovery(views, _FOUND)),
-            ("ingress", ("liveliness_token",), _recovery(views, _FOUND, "sub")),
+            ("ingress", _LISTENED, _with_recovery(views, _RESULTS)),
+            ("egress", ("put", "reply", "declare_queryable"), _with_recovery(views, _RESULTS)),
+            ("ingress", _LIVELINESS, _at(views, _ALIVE) + _recovery(views, _RESULTS)),
+            ("egress", ("liveliness_token",), _at(views, _ALIVE) + _recovery(views, _RESULTS)),
+            ("ingress", ("liveliness_token",), _recovery(views, _RESULTS, "sub")),
         ]
     if monitors:
         rules += [
             ("ingress", (*_LISTENED, *_LIVELINESS), _at(monitors, _ALL)),
             ("egress", ("put", "reply", "liveliness_token"), _at(monitors, _ALL)),
-            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(monitors, _FOUND)),
+            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(monitors, _RESULTS)),
             (
                 "ingress",
                 ("liveliness_token",),
                 _at(monitors, _MONITOR_ALIVE)
-                + _recovery(monitors, _FOUND, "pub")
-                + _recovery(monitors, (*_SENT, *_FOUND), "sub"),
+                + _recovery(monitors, _RESULTS, "pub")
+                + _recovery(monitors, (*_DATA, *_RESULTS), "sub"),
             ),
         ]
     if publishes or monitors:

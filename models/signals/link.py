@@ -19,9 +19,9 @@ from models.errors import MachineFileError
 from models.mistakes import checked, did_you_mean, in_folder, read_toml
 from models.signals.keys import Grant, access_control
 
-_OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")
-_WITHIN = ("unixsock-stream", "unixpipe")
-_OTHERS = (*_WITHIN, "serial", "vsock")
+_HOST_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
+_LOCAL_PROTOCOLS = ("unixsock-stream", "unixpipe")
+_PORTLESS_PROTOCOLS = (*_LOCAL_PROTOCOLS, "serial", "vsock")
 _LOCAL = "127.0.0.1"
 _HIGHEST_PORT = 65535
 
@@ -50,7 +50,7 @@ def is_local(endpoint: str) -> bool:
     """
     protocol, _, rest = endpoint.partition("/")
     host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
-    return protocol in _WITHIN or (protocol in _OF_HOSTS and is_loopback(host))
+    return protocol in _LOCAL_PROTOCOLS or (protocol in _HOST_PROTOCOLS and is_loopback(host))
 
 
 def endpoint_fault(text: str) -> str | None:
@@ -63,18 +63,18 @@ def endpoint_fault(text: str) -> str | None:
     """
     protocol, slash, rest = text.partition("/")
     address = re.split(r"[?#]", rest)[0]
-    if slash and protocol in _OTHERS and address:
+    if slash and protocol in _PORTLESS_PROTOCOLS and address:
         return None
     host = r"(\[[^][\s]+\]|[^][:/\s]+)"
     match = re.fullmatch(rf"{host}:(\d+)", address)
-    if slash and protocol in _OF_HOSTS and match is not None:
+    if slash and protocol in _HOST_PROTOCOLS and match is not None:
         wrong = int(match[2]) > _HIGHEST_PORT
         return f"{text!r}: the port is {match[2]}, expected 0 to {_HIGHEST_PORT}" if wrong else None
     portless = re.fullmatch(rf"{host}(:[^:/]*)?", address)
-    if slash and protocol in _OF_HOSTS and portless is not None:
+    if slash and protocol in _HOST_PROTOCOLS and portless is not None:
         meant = f"{protocol}/{portless[1]}:7447"
         return f"{text!r}: expected a port, a number, after the host; did you mean {meant}?"
-    known = [name for name in _OF_HOSTS if did_you_mean(protocol.rstrip(":"), [name])] or ["tcp"]
+    known = [name for name in _HOST_PROTOCOLS if did_you_mean(protocol.rstrip(":"), [name])] or ["tcp"]
     place = re.fullmatch(rf"(?:[\w-]*:?/+)?(?:{host}:)?(\d+)", text)
     meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or _LOCAL}:{place[2]}"
     if re.fullmatch(r"[A-Za-z][\w.-]*", text):
