@@ -24,7 +24,7 @@ from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
-_INSIDE = 2.0  # standard deviations of the misfit within which nothing has to be explained
+_MOST_MISFIT_Z = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """The sliding window whose latest window is evaluated, and the sequential test that asks for shorter stretches."""
@@ -84,8 +84,8 @@ class Evaluation:
         )
 
     @property
-    def _doubtful(self) -> bool:
-        return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _INSIDE
+    def _fits_badly(self) -> bool:
+        return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
 
     def rivals(self, foreign: Foreign) -> tuple[str, ...]:
         """Stiffness and damping of a place, if a change of one explains the window as well as a wrong gain there.
@@ -124,7 +124,7 @@ class Evaluation:
         The first suspect is what no change of a parameter makes (`foreign`, empty if nothing). Where the window fits
         badly, channels at the end of their range come next, except `faulty` ones, which the evaluation left out.
         """
-        told = foreign or self.shapes or not self._doubtful
+        told = foreign or self.shapes or not self._fits_badly
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
         suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
@@ -231,7 +231,7 @@ class LatestRotation:
             found = np.isfinite(window.hop_speed_rad_s)
             strength = float(np.median(window.hop_strength[found]))
             # A weak line that is found in all hops is real: after balancing, or at another set point, less may be left.
-            self.power = strength * _noise(window) if strength > STRONG or found.all() else self.power
+            self.power = strength * _broadband_power(window) if strength > STRONG or found.all() else self.power
 
     def lost(self, window: WindowStatistics, operation: Operation) -> str:
         """In how many hops the rotation was found, if not in all although its latest power would stand out; else empty.
@@ -239,7 +239,7 @@ class LatestRotation:
         A hop in which the shaft reached or left its speed counts as one without: its line is much weaker than others.
         """
         found = np.isfinite(window.hop_speed_rad_s) & window.settled
-        if window.speed_source == "phase reference" or self.power <= STRONG * _noise(window) or found.all():
+        if window.speed_source == "phase reference" or self.power <= STRONG * _broadband_power(window) or found.all():
             return ""
         slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
         return (
@@ -248,7 +248,7 @@ class LatestRotation:
         )
 
 
-def _noise(window: WindowStatistics) -> float:
+def _broadband_power(window: WindowStatistics) -> float:
     """Power of a window without its lines: geometric mean over the channels of each spectrum's median, units mixed."""
     power = np.median(np.einsum("fii->fi", window.spectrum).real, axis=0)
     return float(np.exp(np.log(np.maximum(power, np.finfo(float).tiny)).mean()))

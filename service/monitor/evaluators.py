@@ -33,8 +33,8 @@ from service.monitor.known_machine import KnownMachineEvaluator
 _SHAPE, _ROTATION = "shape", "rotation"
 # Standard deviations of the misfit: up to which a window holds no change and a shorter stretch is explained, and by how
 # many a stretch's misfit must be below its share of the window's to be of another machine than the rest.
-_INSIDE, _LESS = 2.0, 3.0
-_ASTRIDE = "the machine changed within the window: its latest data fit for themselves, all of it together does not"
+_MOST_MISFIT_Z, _LESS = 2.0, 3.0
+_STRADDLES = "the machine changed within the window: its latest data fit for themselves, all of it together does not"
 _NO_EQUATION = "no equation can be evaluated on this machine; see the result for each channel"
 
 
@@ -92,14 +92,14 @@ class BaselineEvaluator(WindowEvaluator):
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
         short: dict[int, Diagnosis] = {}
         if self._baselines:
-            deciding = self._read(window)
+            deciding = self._diagnose(window)
             self._rotation.take(window)
-            unfit = deciding.unexplained != "" or not deciding.evaluable or (deciding.misfit_z or 0.0) > _INSIDE
+            unfit = deciding.unexplained != "" or not deciding.evaluable or (deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
             if unfit and self._operation is not None and (lost := self._rotation.lost(window, self._operation)):
                 raise EstimationError(f"{self._place}: {lost}")
             if newest is not None:
                 deciding, short = self._newest(*newest, deciding, latest)
-                deciding = self._witnessed(*newest, deciding, latest)
+                deciding = self._with_latest_misfit(*newest, deciding, latest)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
@@ -114,7 +114,7 @@ class BaselineEvaluator(WindowEvaluator):
         """Continue from where `checkpoint` was called, see `WindowEvaluator`."""
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
-    def _read(self, window: WindowStatistics) -> Diagnosis:
+    def _diagnose(self, window: WindowStatistics) -> Diagnosis:
         clear = (window.without_lines if self._lines else window).with_steady_rotation
         return determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
 
@@ -130,7 +130,7 @@ class BaselineEvaluator(WindowEvaluator):
         """
         found: dict[int, Diagnosis] = {}
         whole, misfit_z = test.settings.window_hops, deciding.misfit_z or 0.0
-        if misfit_z <= _INSIDE and test.wanted() == test.settings.short_hops:
+        if misfit_z <= _MOST_MISFIT_Z and test.wanted() == test.settings.short_hops:
             return deciding, found
         limit, start_ns = test.thresholds(whole).outside, sliding.hops[0].start_ns
         outside = misfit_z > limit
@@ -140,15 +140,17 @@ class BaselineEvaluator(WindowEvaluator):
         for hops in filter(latest.__ge__, test.wanted()):
             with suppress(EstimationError):  # too little data for itself, or outside the commissioned conditions
                 if (statistics := sliding.statistics(hops, lagged=True)) is not None:
-                    read = self._read(statistics)
-                    most = min(_INSIDE, misfit_z * (hops / whole) ** 0.5 - _LESS) if outside else _INSIDE
+                    read = self._diagnose(statistics)
+                    most = min(_MOST_MISFIT_Z, misfit_z * (hops / whole) ** 0.5 - _LESS) if outside else _MOST_MISFIT_Z
                     if not read.unexplained and (read.misfit_z or 0.0) < most:
                         found[hops] = read
         if found and outside and not deciding.unexplained:
-            deciding = replace(deciding, unexplained=_ASTRIDE)
+            deciding = replace(deciding, unexplained=_STRADDLES)
         return deciding, found
 
-    def _witnessed(self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int) -> Diagnosis:
+    def _with_latest_misfit(
+        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
+    ) -> Diagnosis:
         """The window's diagnosis, with the misfit of its latest hops if an unbalance is named and theirs is larger.
 
         Where a foundation goes soft, an unbalance stands out first: while most of the window is from before the change,
@@ -162,7 +164,7 @@ class BaselineEvaluator(WindowEvaluator):
             return deciding
         with suppress(EstimationError):
             if (statistics := sliding.statistics(hops, lagged=True)) is not None:
-                misfit_z = misfit_beside(stretch_of(self._read(statistics), 0, 1), names)
+                misfit_z = misfit_beside(stretch_of(self._diagnose(statistics), 0, 1), names)
                 return replace(deciding, misfit_z=max(misfit_z, deciding.misfit_z or 0.0))
         return deciding
 

@@ -30,20 +30,20 @@ from rotorwatch.records.windows import Equation, Opinion, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, opinion_of, settled
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
-_STEADY = 0.15
+_MOST_SPEED_RANGE = 0.15
 """Relative range of speed within a window up to which removing the rotation hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each,
 ``tests/diagnosis/window/test_window.py``)."""
 
-_INSIDE, _BETTER, _SURELY_OUTSIDE = 2.0, 3.0, 8.0
+_MOST_MISFIT_Z, _LEAST_MISFIT_DROP, _LEAST_FOREIGN_MISFIT = 2.0, 3.0, 8.0
 """Standard deviations of the misfit: up to which a window is explained beyond doubt, by which one explanation must be
 better than another, and assigned at least to a window that is outside the model for other reasons than its spectra."""
-_HEAVIEST, _SURELY = 20.0, 3.0
+_MOST_UNBALANCE_RATIO, _LEAST_STANDARD_ERRORS = 20.0, 3.0
 """Largest credible multiple of the machine file's unbalance, and by how many standard errors it must be exceeded: a
 lost blade makes ten times the unbalance, millimetres in place of micrometres a thousand times."""
-_SILENT = {FaultKind.MISSING, FaultKind.STUCK}
+_FAULTS_WITHOUT_SIGNAL = {FaultKind.MISSING, FaultKind.STUCK}
 """Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
-_OUTSIDE = 4.0
+_LEAST_MISFIT_TO_SPLIT = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested on their own."""
 
 
@@ -68,10 +68,10 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._explained_ns: int | None = None
         self._given, self._bundle = machine, bundle
         # The sense of the gyroscopic moments is open until a window has been explained.
-        self._open, self._opposite = commissioned is None, False
+        self._sense_open, self._sense_opposite = commissioned is None, False
         # If the file gives no angle of the heavy spot, the assumed one is checked in the first window that shows it.
         given = "unbalance_phase_rad" in machine.operation.model_fields_set
-        self._sought = commissioned is None and not given
+        self._angle_unchecked = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window on which the other sense was tried
         self._rotation = LatestRotation()
         self._compare_with(machine)
@@ -92,7 +92,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         """
         none = super().spared(plan, findings)
         own = [one for one in findings if not set(one.states).issubset(plan.others)]
-        if none is not None or plan.angle_column is None or any(one.kind not in _SILENT for one in own):
+        if none is not None or plan.angle_column is None or any(one.kind not in _FAULTS_WITHOUT_SIGNAL for one in own):
             return none
         lost = implicated(own)
         enough = "theta" not in lost and len(plan.states_without(lost)) > len(plan.states) / 2
@@ -104,13 +104,13 @@ class KnownMachineEvaluator(WindowEvaluator):
         speed = self._speed(window)
         self._rotation.take(window)
         window = window if self.directed else replace(window, directed=False)
-        deciding = self._explained(window)
-        if self._open:
-            deciding = self._by_sense(window, deciding)
-        if self._elsewhere(deciding):
+        deciding = self._diagnose_window(window)
+        if self._sense_open:
+            deciding = self._try_other_sense(window, deciding)
+        if self._contradicts_assumed_angle(deciding):
             self.directed, window = False, replace(window, directed=False)
-            deciding = self._explained(window)
-        deciding = self._judged(window, self._within(deciding))
+            deciding = self._diagnose_window(window)
+        deciding = self._require_steady_speed(window, self._check_unbalance(deciding))
         short = {} if newest is None else self._newest(window, *newest, deciding, latest)
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
@@ -130,18 +130,18 @@ class KnownMachineEvaluator(WindowEvaluator):
         sense: Literal["", "opposite"] = "opposite" if self._machine.rotor.I2p_kg_m2 < 0 else ""
         return Evaluation(deciding, short, equations, tuple(opinions), speed, gyroscopic=sense)
 
-    def _elsewhere(self, deciding: Diagnosis) -> bool:
+    def _contradicts_assumed_angle(self, deciding: Diagnosis) -> bool:
         """Whether the first window with a readable 1x vector contradicts the assumed angle of the heavy spot.
 
         Only if the file gives no angle. A turn cannot be read then, and the unbalance is judged by its size.
         """
         vector = deciding.unbalance
-        if not self._sought or self._open or deciding.unexplained or vector is None or vector.foreign:
+        if not self._angle_unchecked or self._sense_open or deciding.unexplained or vector is None or vector.foreign:
             return False
-        self._sought = vector.turned_error_deg is None
+        self._angle_unchecked = vector.turned_error_deg is None
         return self.directed and vector.turned
 
-    def _explained(self, window: WindowStatistics) -> Diagnosis:
+    def _diagnose_window(self, window: WindowStatistics) -> Diagnosis:
         try:
             return self._decide(window, self._likelihood.window)
         except UnexplainedError as error:
@@ -149,32 +149,32 @@ class KnownMachineEvaluator(WindowEvaluator):
             nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
             return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=reason)
 
-    def _by_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
+    def _try_other_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
         """The diagnosis with the sense of the gyroscopic moments that explains the window; `given` if neither does.
 
         The other sense takes a search from scratch, so it is tried once in a window's length.
         """
         misfit_z = _misfit_z(given)
         tried = window.start_ns < self._tried_ns <= window.end_ns and (self._tried_in_vain or np.isinf(misfit_z))
-        if misfit_z <= _INSIDE or tried:
-            self._open = misfit_z > _INSIDE
+        if misfit_z <= _MOST_MISFIT_Z or tried:
+            self._sense_open = misfit_z > _MOST_MISFIT_Z
             return given
         # A window that neither sense explains, such as a disturbance, decides nothing: try the next that is read.
         self._tried_ns, self._tried_in_vain = window.end_ns, bool(np.isfinite(misfit_z))
         before = self._machine, self._likelihood, self._others
         self._compare_with(in_sense(self._given, "opposite"))
         try:
-            other = self._explained(window)
-            self._opposite = _misfit_z(other) <= min(_OUTSIDE, misfit_z - _BETTER)
+            other = self._diagnose_window(window)
+            self._sense_opposite = _misfit_z(other) <= min(_LEAST_MISFIT_TO_SPLIT, misfit_z - _LEAST_MISFIT_DROP)
         except EstimationError:
             other = given
         finally:
-            if not self._opposite:
+            if not self._sense_opposite:
                 self._machine, self._likelihood, self._others = before
-        self._open = not self._opposite
-        return other if self._opposite else given
+        self._sense_open = not self._sense_opposite
+        return other if self._sense_opposite else given
 
-    def _within(self, decided: Diagnosis) -> Diagnosis:
+    def _check_unbalance(self, decided: Diagnosis) -> Diagnosis:
         """The diagnosis, marked as unexplained if its unbalance is so large that units or e_m must be wrong."""
         vector, e = decided.unbalance, next((one for one in decided.evaluable if one.name == "e"), None)
         if decided.unexplained:
@@ -185,13 +185,13 @@ class KnownMachineEvaluator(WindowEvaluator):
             times, error = 1 + (e.relative_change or 0.0), e.standard_error or 0.0
         else:
             return decided
-        if times - _SURELY * error < _HEAVIEST:
+        if times - _LEAST_STANDARD_ERRORS * error < _MOST_UNBALANCE_RATIO:
             return decided
         why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
-        why = f"{why} {_HEAVIEST:g} times: check the units of the channels and e_m"
+        why = f"{why} {_MOST_UNBALANCE_RATIO:g} times: check the units of the channels and e_m"
         return replace(decided, suspect="", unexplained=why)
 
-    def _judged(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
+    def _require_steady_speed(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:
         """Return the diagnosis, unless it fits badly and the speed changed too fast for the rotation to be removed.
 
         A shaft that is switched off, or changes its speed at once, leaves part of its rotation in a hop or two. A
@@ -202,14 +202,15 @@ class KnownMachineEvaluator(WindowEvaluator):
         EstimationError
             If it fits badly, and the speed changed too fast or the rotation was not found in every hop.
         """
-        if not decided.unexplained and (decided.misfit_z or 0.0) <= _INSIDE:
+        if not decided.unexplained and (decided.misfit_z or 0.0) <= _MOST_MISFIT_Z:
             return decided
         if lost := self._rotation.lost(window, self._machine.operation):
             raise EstimationError(f"{self._machine.title}: {lost}")
         adjoin = np.isfinite(window.hop_jump_rad[1:])  # hops adjoin, and the shaft angle is measured
         steps = np.abs(np.diff(window.hop_speed_rad_s))[adjoin] / self._machine.operation.speed_rad_s
         fastest = float(np.max(steps, initial=0.0))
-        limit = max(STEADY, round(_STEADY / max(1, self._machine.window.hops - 1), 3))  # per hop of a window-long ramp
+        # Per hop of a ramp as long as a window.
+        limit = max(STEADY, round(_MOST_SPEED_RANGE / max(1, self._machine.window.hops - 1), 3))
         if fastest <= limit:
             return decided
         told, most = beyond(100 * fastest, 100 * limit)
@@ -224,7 +225,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Diagnose the newest hops alone, at each length (hops, up to `latest`) that the sequential test asks for."""
         wanted, evaluated = tuple(hops for hops in test.wanted() if hops <= latest), {}
         # A window outside the model may straddle a change; its newest hops are then inside.
-        closely = deciding.misfit_z is not None and deciding.misfit_z > _OUTSIDE
+        closely = deciding.misfit_z is not None and deciding.misfit_z > _LEAST_MISFIT_TO_SPLIT
         if deciding.unexplained:
             # If some of the window's data were explained, it may straddle a change: the shortest stretch shows that.
             straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
@@ -236,13 +237,13 @@ class KnownMachineEvaluator(WindowEvaluator):
                 if (statistics := sliding.statistics(hops, lost=window.lost)) is not None:
                     statistics = replace(statistics, directed=self.directed, lines=window.lines)
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
-                    evaluated[hops] = self._judged(statistics, self._within(decided))
+                    evaluated[hops] = self._require_steady_speed(statistics, self._check_unbalance(decided))
         return evaluated
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Starting points of the likelihood search, and what was found out so far; networks have no state."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
-        sense = [self._open, self._opposite, self._tried_in_vain, self._tried_ns, self._sought]
+        sense = [self._sense_open, self._sense_opposite, self._tried_in_vain, self._tried_ns, self._angle_unchecked]
         known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
         known |= {_ROTATION: np.array(self._rotation.power)}
         return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
@@ -257,7 +258,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
         self._compare_with(machine)
         self._likelihood, self._explained_ns = likelihood, next(iter(explained), None)
-        self._open, self._opposite, self._sought = bool(still_open), bool(opposite), bool(sought)
+        self._sense_open, self._sense_opposite, self._angle_unchecked = bool(still_open), bool(opposite), bool(sought)
         self._tried_ns, self._tried_in_vain, self.directed = tried_ns, bool(in_vain), directed
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
@@ -275,8 +276,8 @@ class KnownMachineEvaluator(WindowEvaluator):
             )
         slowest, fastest = window.speed_range
         varied = (fastest - slowest) / operation.speed_rad_s
-        if varied > _STEADY:
-            text, limit = beyond(100 * varied, 100 * _STEADY)
+        if varied > _MOST_SPEED_RANGE:
+            text, limit = beyond(100 * varied, 100 * _MOST_SPEED_RANGE)
             raise EstimationError(
                 f"{self._machine.title}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm "
                 f"within the window, by {text} % of nominal, evaluation limit {limit} %"
@@ -299,7 +300,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         usable = not (self._commissioned or stated.unexplained)
         if vector is not None and vector.foreign and seen and usable and stated.misfit_z is not None:
             # Not on a commissioned machine: its levels are compared with the healthy 1x.
-            misfit_z = max(stated.misfit_z, _SURELY_OUTSIDE)
+            misfit_z = max(stated.misfit_z, _LEAST_FOREIGN_MISFIT)
             stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 

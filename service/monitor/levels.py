@@ -37,11 +37,11 @@ _DEPENDS_ON: Any = {
 }
 """Fields of a machine file on which the levels of first windows depend; these outlast other changes and updates."""
 _WINDOWS_OF_CONTACT = 4
-_STILL_RAD = 0.1
+_LEAST_TURN_RAD = 0.1
 """A smaller turn in a hop counts as standstill: an encoder may waver. The slowest kilns turn further."""
-_NEARLY_ALL = 0.9
+_LEAST_HIDING_SHARE = 0.9
 """Share of a channel's random vibration from which a new line hides the machine's own vibration."""
-_OF_THE_ANGLE = {*ORDERS, "not_x1", "x1_phase_lag_deg", "x2_phase_lag_deg"}
+_MEASURES_OF_ANGLE = {*ORDERS, "not_x1", "x1_phase_lag_deg", "x2_phase_lag_deg"}
 
 
 class LevelWatch:
@@ -70,7 +70,7 @@ class LevelWatch:
         self._lines = LatestLines()
         self._moved, self._moved_ns = False, 0  # time from which all data are at about the newest speed
         self.latest: tuple[ChannelLevels, ...] = ()  # of the latest window; empty before the first hop
-        self._found: WindowLevels | None = None
+        self._levels: WindowLevels | None = None
         self._to_learn: tuple[int, int, WindowLevels] | None = None  # learned unless the shaft angle is at fault
         self._states = [state_name(channel) for channel in channels]
         self._machine = machine
@@ -98,15 +98,15 @@ class LevelWatch:
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:
             return
-        self._moved, columns = self._has_moved(found, window.hops), self._at(missing)
+        self._moved, columns = self._has_moved(found, window.hops), self._columns_of(missing)
         self.latest = self._judge.judge(found, self.reference, moved=self._moved, missing=columns)
-        self._found = found
-        stood = any(abs(hop.turned_rad) < _STILL_RAD for hop in window.hops)  # False without a shaft angle: nan
+        self._levels = found
+        stood = any(abs(hop.turned_rad) < _LEAST_TURN_RAD for hop in window.hops)  # False without a shaft angle: nan
         if self._takes_first and window.filled == 1 and not stood:
             learned = found.without(columns, self._pairs)
             self._to_learn = window.hops[0].start_ns, window.hops[-1].end_ns, learned
 
-    def _at(self, states: Collection[str]) -> list[int]:
+    def _columns_of(self, states: Collection[str]) -> list[int]:
         """Columns of the channels that measure these states."""
         return [column for column, state in enumerate(self._states) if state in states]
 
@@ -134,13 +134,13 @@ class LevelWatch:
         `faulty` channels are ignored.
         """
         turned = self.reference is not None and any(state.speed_rad_s for state in self.reference.states)
-        if self._found is None:
+        if self._levels is None:
             return Foreign()
         healthy, speed_rad_s = self.reference, statistics.speed_rad_s
-        judge = partial(self._judge.foreign, named=named, faulty=self._at(faulty))
+        judge = partial(self._judge.foreign, named=named, faulty=self._columns_of(faulty))
         if not statistics.settled.all() or (turned and statistics.speed_source == "unknown"):
             # Rotation has leaked into the random part and the lines, so leave both out; contact is judged hop by hop.
-            bare = replace(self._found, moments=None, lines=None)
+            bare = replace(self._levels, moments=None, lines=None)
             return judge(bare, self.latest, healthy, self._contact)
         if healthy is not None and healthy.lines is not None and math.isfinite(speed_rad_s) and speed_rad_s:
             lines = steady_lines(window.plan, window.hops, statistics, faulty)
@@ -159,14 +159,14 @@ class LevelWatch:
                     f"random vibration of {line.state}{beats}) that the healthy machine did not have: a neighbouring "
                     "machine, whirl or looseness"
                 )
-                return Foreign(with_channel_names(text, self._machine.sensors), hides=line.share >= _NEARLY_ALL)
+                return Foreign(with_channel_names(text, self._machine.sensors), hides=line.share >= _LEAST_HIDING_SHARE)
         if self._by_theory is not None:
-            healthy = self._expected or self._by_file(self._by_theory, self._found)
-            if self._found.contact is not None and self._found.lines is not None:  # the reference is complete
+            healthy = self._expected or self._theoretical_reference(self._by_theory, self._levels)
+            if self._levels.contact is not None and self._levels.lines is not None:  # the reference is complete
                 self._expected = healthy
-        return judge(self._found, self.latest, healthy, self._contact)
+        return judge(self._levels, self.latest, healthy, self._contact)
 
-    def _by_file(self, machine: Machine, levels: WindowLevels) -> LevelReference:
+    def _theoretical_reference(self, machine: Machine, levels: WindowLevels) -> LevelReference:
         """Reference from theory, for a machine that has not been commissioned."""
         operation, names = machine.operation, [machine.sensors[column].name for column in self._columns]
         slowest, fastest = (operation.speed_rad_s * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
@@ -175,9 +175,9 @@ class LevelWatch:
 
     def rewired(self) -> tuple[SensorFault, ...]:
         """Which places' sensors were exchanged or reversed, as the latest window shows; see `LevelJudge.rewired`."""
-        if self._found is None or self.reference is None:
+        if self._levels is None or self.reference is None:
             return ()
-        found = self._judge.rewired(self._found, self.reference)
+        found = self._judge.rewired(self._levels, self.reference)
         return () if found is None else (found,)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -233,7 +233,7 @@ class LevelWatch:
         pairs = ((self._states[first], self._states[second]) for first, second in self._pairs)
         halved = {pair[0] for pair in pairs if not set(pair).isdisjoint(faulty)}
         self.latest = tuple(
-            self._known(levels, turning=turning, halved=state in halved)
+            self._without_unmeasurable(levels, turning=turning, halved=state in halved)
             for state, levels in zip(self._states, self.latest, strict=False)
         )
         for state, levels in zip(self._states, self.latest, strict=False):
@@ -245,9 +245,9 @@ class LevelWatch:
             small = now.small and not self._moved and turning and state not in halved.union(faulty)
             alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=small)
 
-    def _known(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
+    def _without_unmeasurable(self, levels: ChannelLevels, *, turning: bool, halved: bool) -> ChannelLevels:
         """Drop measures that need the shaft angle if not `turning`, or both probes of a place if `halved`."""
-        gone = (set() if turning else _OF_THE_ANGLE) | ({"s_max"} if halved else set())
+        gone = (set() if turning else _MEASURES_OF_ANGLE) | ({"s_max"} if halved else set())
         usual = turning or not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))
         return levels.model_copy(update=dict.fromkeys(gone) | {"limits": tuple(kept)}) if gone else levels

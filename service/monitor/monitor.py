@@ -79,7 +79,7 @@ class MachineMonitor:
         self._reached_ns: int | None = None
         self._kept_is_valid = True
         self._not_recalled = self._dropped = 0
-        self._held: list[tuple[bytes, bytes, str]] = []
+        self._held_messages: list[tuple[bytes, bytes, str]] = []
         self._drops: dict[tuple[int, int], int] = {}
         self._fault = ""
         self._defect: Exception | None = None
@@ -117,8 +117,8 @@ class MachineMonitor:
             if self._gate.knows(block):
                 self._recall(block)
             else:  # a new block may have overtaken a known one
-                self._held.append((payload, attachment, encoding))
-            return self._released()
+                self._held_messages.append((payload, attachment, encoding))
+            return self._step_held()
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} arrived in two versions; neither is used"
             verdict = Admission(Reason.CONFLICT, f"{self.machine.title}: {text}")
@@ -153,18 +153,18 @@ class MachineMonitor:
         lost = self._not_recalled
         return f"{lost} hops of the window were not received again, and it is filling anew" if lost else ""
 
-    def _released(self) -> tuple[MonitorReport, ...]:
+    def _step_held(self) -> tuple[MonitorReport, ...]:
         """Step the new blocks held while the window is refilled, once it is complete or too many blocks are held."""
-        if self._window.lacks and len(self._held) <= self.machine.ingest.reorder_blocks:
+        if self._window.lacks and len(self._held_messages) <= self.machine.ingest.reorder_blocks:
             return ()
         self._not_recalled += self._window.give_up()
-        held, self._held = self._held, []
+        held, self._held_messages = self._held_messages, []
         return tuple(report for one in held for report in self.step_payload(*one))
 
     def flush(self) -> tuple[MonitorReport, ...]:
         """Take the blocks that wait for earlier ones, which will not come any more."""
         self._not_recalled += self._window.give_up()
-        self._done += self._released()
+        self._done += self._step_held()
         self._due.extend(self._arrivals.flush())
         return self._step_due()
 
@@ -199,21 +199,21 @@ class MachineMonitor:
             Immutable; refused blocks, gaps and defects of the monitor are stated in it, never raised.
         """
         dropped = self._drops.pop((block.run, block.sequence), 0)
-        verdict = self._judged(block, schema_hash, dropped)
+        verdict = self._admission_of(block, schema_hash, dropped)
         if not verdict.accepted:
             self._dropped += dropped
             return MonitorReport(verdict)
         self._used, block = block, self._missing.take(block)
         windows: list[Report] = []
         try:
-            windows.extend(map(self._evaluate, self._hops(block, verdict, dropped)))  # each before the next hop
+            windows.extend(map(self._evaluate, self._feed_window(block, verdict, dropped)))  # each before the next hop
         except Exception as error:  # whatever it is, the machine must not look healthy because of it
             self._window.gap()
-            self._failed(error, block.end_ns)
+            self._note_defect(error, block.end_ns)
         fault, self._defect = self._defect, None
         return MonitorReport(verdict, tuple(windows), self._alarms.take(), len(block.samples) / block.rate_hz, fault)
 
-    def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
+    def _feed_window(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Feed an accepted block to the window; return the ends of hops it completes, each to be evaluated in turn."""
         self._not_recalled += self._window.give_up()
         joined = verdict.continuous and not verdict.new_snapshot
@@ -238,7 +238,7 @@ class MachineMonitor:
         self._data_path.fault(what, time_ns)
         return self._alarms.take()
 
-    def _failed(self, error: Exception, time_ns: int) -> None:
+    def _note_defect(self, error: Exception, time_ns: int) -> None:
         """Note a defect of the monitor: the machine is not evaluable until a window is evaluated again."""
         self._defect = error
         self._fault = f"a defect in the monitor, not in the machine: {type(error).__name__}: {error}"
@@ -352,7 +352,7 @@ class MachineMonitor:
             self.end_ns,
         )
 
-    def _judged(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
+    def _admission_of(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
         """Judge a block by the gate and, if it is the first one after a restart, by the time of the data before."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
@@ -387,7 +387,7 @@ class MachineMonitor:
             missing = self._missing.found(self._window.first_ns, end_ns)
             report = self._reporter.report(end_ns, missing, skipped=skipped)
         except Exception as error:
-            self._failed(error, end_ns)
+            self._note_defect(error, end_ns)
             report = self._reporter.unread(end_ns, end_ns, HealthState.NOT_EVALUABLE, reason=self._fault)
         if skipped:
             report, count = report.model_copy(update={"skipped": True}), self._quality.skipped_windows + 1

@@ -33,12 +33,12 @@ from service.monitor.alarms.operation import (
     UnknownAlarm,
 )
 
-_TAKEN_BACK = 0.5
+_LEAST_KEPT_PROBABILITY = 0.5
 """Probability below which a parameter that was named is no longer taken to have changed."""
-_ANOTHER = 4
+_LEAST_CHANGES_UNNAMED = 4
 """Outside the model, number of apparently changed parameters from which none is named: it is another machine, or what
 is wrong concerns all of it."""
-_HELD = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
+_HELD_STIFF_NOTE = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class AlarmBook:
         self._settings = settings
         self._alarms: dict[str, Alarm] = {}
         self.next_sequence = 0  # number the next event will have
-        self._untold: list[AlarmEvent] = []
+        self._pending_events: list[AlarmEvent] = []
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -86,7 +86,7 @@ class AlarmBook:
         An event is numbered as soon as it happens. If its caller fails before passing it on, the next caller does:
         otherwise the number would be missing from the log for ever.
         """
-        told, self._untold = tuple(self._untold), []
+        told, self._pending_events = tuple(self._pending_events), []
         return told
 
     # What the data say
@@ -120,10 +120,10 @@ class AlarmBook:
         named = [finding.name for finding in verdict.changed]
         unreserved = set(named)
         probability = {one.name: one.probability for one in verdict.candidates}
-        another = verdict.outside_model and len(named) >= _ANOTHER
+        another = verdict.outside_model and len(named) >= _LEAST_CHANGES_UNNAMED
         nameless = another or hidden
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
-        held = {*named, *(one for one, likely in probability.items() if likely >= _TAKEN_BACK)}
+        held = {*named, *(one for one, likely in probability.items() if likely >= _LEAST_KEPT_PROBABILITY)}
         # Without parameters the unbalance is read through the stiffness to ground at running speed. If that has changed
         # in both planes, the bearings' support may move, which makes the stiffness differ between frequencies. The same
         # holds if only one stiffness, or the unbalance in their place, is named, and both read softer.
@@ -158,7 +158,7 @@ class AlarmBook:
                     or (unlike and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
                     growth=larger if reading.name == "e" else None,
                     evidence=evidence,
-                    note=_HELD if held_stiff else "" if reading.vector is None else reading.vector.text,
+                    note=_HELD_STIFF_NOTE if held_stiff else "" if reading.vector is None else reading.vector.text,
                 )
         if verdict.outside_model and not verdict.current:
             # Nothing is read from unexplained data, and parameters named before are named with reserve from now on.
@@ -223,7 +223,7 @@ class AlarmBook:
             return ()
         limits, size = self._settings.for_parameter(parameter), abs(change)
         alarm = replace(
-            self._known(parameter, time_ns),
+            self._alarm_named(parameter, time_ns),
             change=change,
             standard_error=standard_error,
             low_confidence=low_confidence,
@@ -234,7 +234,7 @@ class AlarmBook:
         beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
         # With reserve, another parameter may have changed instead; levels say whether it is dangerous.
         danger = beyond and min(size, size if growth is None else growth) > limits.danger_above and not low_confidence
-        return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
+        return self._run_delays(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
     def update_state(  # noqa: PLR0913  # what is known of a state
         self,
@@ -254,11 +254,11 @@ class AlarmBook:
         """
         if not present and name not in self._alarms:
             return ()
-        known = self._known(name, time_ns)
+        known = self._alarm_named(name, time_ns)
         evidence = evidence or known.evidence
         alarm = replace(known, note=note if present else known.note, evidence=evidence)
         gone = not present if small is None else small
-        return self._judge(alarm, time_ns, beyond=present, small=gone, danger=danger, at_once=at_once)
+        return self._run_delays(alarm, time_ns, beyond=present, small=gone, danger=danger, at_once=at_once)
 
     def suppress(self, speed_rpm: float | None, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Apply the suppression rules; where the speed is unknown, those that depend on it stay as they are.
@@ -269,7 +269,7 @@ class AlarmBook:
         ruled = [name for rule in self._settings.suppress for name in rule.alarms]
         left = [alarm.name for alarm in self.alarms if alarm.rules]
         for name in dict.fromkeys((*ruled, *left)):
-            alarm = self._known(name, time_ns)
+            alarm = self._alarm_named(name, time_ns)
             about = [rule for rule in self._settings.suppress if name in rule.alarms]
             holding = [rule for rule in about if self._applies(rule, alarm, speed_rpm)]
             rules = tuple(rule.identity for rule in holding)
@@ -278,9 +278,9 @@ class AlarmBook:
             because = "; ".join(dict.fromkeys(rule.because for rule in holding))
             alarm = replace(alarm, rules=rules, suppressed_by=because)
             if rules and alarm.state is not AlarmState.SUPPRESSED:
-                events += self._happen(alarm, EventKind.SUPPRESSED, time_ns, reason=because)
+                events += self._transition(alarm, EventKind.SUPPRESSED, time_ns, reason=because)
             elif not rules:
-                events += self._happen(alarm, EventKind.UNSUPPRESSED, time_ns)
+                events += self._transition(alarm, EventKind.UNSUPPRESSED, time_ns)
             else:
                 self._alarms[name] = alarm
         return tuple(events)
@@ -320,7 +320,7 @@ class AlarmBook:
         """
         if not is_alarm(operation.alarm):
             raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
-        alarm = self._known(operation.alarm, time_ns)
+        alarm = self._alarm_named(operation.alarm, time_ns)
         self._must_be_as_seen(alarm, operation)
         kind = KIND_OF_EVENT[operation.kind]
         if follow(alarm.state, kind, present=alarm.present, latching=self._latches(alarm)) is None:
@@ -338,7 +338,7 @@ class AlarmBook:
             )
         elif kind is EventKind.RETURNED_TO_SERVICE:
             alarm = replace(alarm, out_of_service_by="", out_of_service_reason="")
-        events = self._happen(alarm, kind, time_ns, actor=operation.actor, reason=operation.reason)
+        events = self._transition(alarm, kind, time_ns, actor=operation.actor, reason=operation.reason)
         return events + self._suppressed_again(alarm.name, time_ns)
 
     # Surviving a restart
@@ -365,11 +365,11 @@ class AlarmBook:
         # Another version of the program may have had other alarms.
         self._alarms = {alarm.name: alarm for alarm in page.alarms if is_alarm(alarm.name)}
         self.next_sequence = max(page.next_sequence, next_sequence or 0)
-        self._untold = []
+        self._pending_events = []
 
     # Inside
 
-    def _known(self, name: str, time_ns: int) -> Alarm:
+    def _alarm_named(self, name: str, time_ns: int) -> Alarm:
         return self._alarms.get(name) or Alarm(name, since_ns=time_ns)
 
     def _latches(self, alarm: Alarm) -> bool:
@@ -405,7 +405,7 @@ class AlarmBook:
         until_ns = time_ns + round(duration_s * 1e9)
         return Shelf(until_ns=until_ns, one_shot=operation.one_shot, by=operation.actor, reason=operation.reason)
 
-    def _judge(
+    def _run_delays(
         self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool, at_once: bool = False
     ) -> tuple[AlarmEvent, ...]:
         """Run the delays, and raise, clear or escalate the alarm if that is due."""
@@ -423,21 +423,21 @@ class AlarmBook:
                 occurrence=alarm.occurrence + 1,
                 beyond_ns=None,
             )
-            return self._happen(alarm, EventKind.RAISED, time_ns)
+            return self._transition(alarm, EventKind.RAISED, time_ns)
         if small_ns is not None and (at_once or (time_ns - small_ns) / 1e9 >= settings.off_delay_s):
             alarm = replace(alarm, present=False, raised_ns=None, small_ns=None)
-            events = self._happen(alarm, EventKind.CLEARED, time_ns)
+            events = self._transition(alarm, EventKind.CLEARED, time_ns)
             if alarm.shelf is not None and alarm.shelf.one_shot:
                 events += self._unshelve(self._alarms[alarm.name], time_ns, "the condition has cleared")
             return events
         if alarm.present and danger and alarm.severity is Severity.ALERT:
             alarm = replace(alarm, severity=Severity.DANGER)
-            return self._happen(alarm, EventKind.ESCALATED, time_ns)
+            return self._transition(alarm, EventKind.ESCALATED, time_ns)
         self._alarms[alarm.name] = alarm
         return ()
 
     def _unshelve(self, alarm: Alarm, time_ns: int, reason: str, actor: str = "") -> tuple[AlarmEvent, ...]:
-        events = self._happen(replace(alarm, shelf=None), EventKind.UNSHELVED, time_ns, actor=actor, reason=reason)
+        events = self._transition(replace(alarm, shelf=None), EventKind.UNSHELVED, time_ns, actor=actor, reason=reason)
         return events + self._suppressed_again(alarm.name, time_ns)
 
     def _suppressed_again(self, name: str, time_ns: int) -> tuple[AlarmEvent, ...]:
@@ -445,9 +445,9 @@ class AlarmBook:
         alarm = self._alarms[name]
         if not alarm.rules or not alarm.state.annunciated:
             return ()
-        return self._happen(alarm, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
+        return self._transition(alarm, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
 
-    def _happen(
+    def _transition(
         self, alarm: Alarm, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
     ) -> tuple[AlarmEvent, ...]:
         """Move the alarm through its life cycle and record the event."""
@@ -466,7 +466,7 @@ class AlarmBook:
         event = AlarmEvent(kind, time_ns, self.next_sequence, alarm, before, actor, reason)
         self.next_sequence += 1
         self._alarms[alarm.name] = alarm
-        self._untold.append(event)
+        self._pending_events.append(event)
         return (event,)
 
 

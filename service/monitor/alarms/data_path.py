@@ -65,23 +65,23 @@ class DataPathAlarms:
         missing = Evidence(start_ns=before_ns, end_ns=start_ns) if verdict.gap_s > 0 else None
         overloaded = dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
-            self._lost(before_ns)
+            self._raise_silence(before_ns)
         self._refused = ""
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if overloaded:
-            note = self._unseen(blocks=dropped, gap_s=verdict.gap_s)
+            note = self._add_unevaluated(blocks=dropped, gap_s=verdict.gap_s)
             book.update_state(OVERLOADED, True, start_ns, note, evidence=missing, at_once=True)
         elif verdict.gap_s > 0 and verdict.gap_s >= self._gap_s:
             book.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
         if verdict.clock_step_s and not verdict.new_run:
             book.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
-        torn = self._torn(verdict, start_ns)
+        torn = self._frequent_gaps(verdict, start_ns)
         if torn:
             book.update_state(GAP, True, start_ns, torn, at_once=True)
         book.suppress(None, start_ns)
         return torn
 
-    def _torn(self, verdict: Admission, start_ns: int) -> str:
+    def _frequent_gaps(self, verdict: Admission, start_ns: int) -> str:
         """Sentence saying that gaps, each too short for an alarm, are so frequent that no hop is whole; else empty."""
         if self._whole_ns is None or verdict.clock_step_s or verdict.gap_s >= self._gap_s:
             self._whole_ns = start_ns
@@ -96,7 +96,7 @@ class DataPathAlarms:
     def passed(self, time_ns: int, end_ns: int | None) -> None:
         """Raise the alarm on silence if the newest data ended long enough ago."""
         if end_ns is not None and time_ns - end_ns >= self._silence_ns:
-            self._lost(end_ns)
+            self._raise_silence(end_ns)
 
     def conflict(self, text: str, time_ns: int, *, at_once: bool = False) -> None:
         """Update the alarm on publishers that contradict each other; `text` is empty if none do."""
@@ -112,7 +112,7 @@ class DataPathAlarms:
             self._book.update_state(name, False, end_ns)
         if skipped:
             evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
-            note = self._unseen(windows=1)
+            note = self._add_unevaluated(windows=1)
             self._book.update_state(OVERLOADED, True, end_ns, note, evidence=evidence, at_once=True)
 
     def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics, *, standing: bool) -> None:
@@ -135,7 +135,7 @@ class DataPathAlarms:
         """The monitor itself is at fault; that is over once a hop has been evaluated for the off-delay."""
         self._book.update_state(FAULT, True, time_ns, what, at_once=True)
 
-    def _unseen(self, *, windows: int = 0, blocks: int = 0, gap_s: float = 0.0) -> str:
+    def _add_unevaluated(self, *, windows: int = 0, blocks: int = 0, gap_s: float = 0.0) -> str:
         """Add to what has not been evaluated since the alarm on it was raised, and return the sum in words."""
         if not self._book.present(OVERLOADED):
             self._unseen_windows, self._unseen_blocks, self._unseen_s = 0, 0, 0.0
@@ -146,7 +146,7 @@ class DataPathAlarms:
         lost = f"; not evaluated: {self._unseen_blocks} blocks, {lasting(self._unseen_s)} of data"
         return f"this computer cannot keep up{skipped}{lost if self._unseen_blocks else ''}"
 
-    def _lost(self, end_ns: int) -> None:
+    def _raise_silence(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due, so that live and replay say the same."""
         # Not blocks that came later, or just before the alarm was due: live they are not known yet.
         known = self._refused and end_ns - self._silence_ns < self._refused_ns < end_ns + self._silence_ns // 2
