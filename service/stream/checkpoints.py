@@ -115,7 +115,7 @@ class StepWriter:
         if (generation := self._history.generation) != self._generation:
             self._kept, self._generation = (), generation
         reports: tuple[StoredReport, ...] = ()
-        told = tuple(self._told(event, recorded_ns) for event in self._owed)
+        told = tuple(self._to_publish(event, recorded_ns) for event in self._owed)
         try:
             reports = tuple(stored_report(window) for window in windows)
             state = monitor.state(self._kept, whole=whole)
@@ -128,7 +128,7 @@ class StepWriter:
         self._kept, self._owed = state.parts, ()
         return reports, told, written
 
-    def _told(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
+    def _to_publish(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
         """An event as it is published; one that cannot be converted is published without its details."""
         try:
             return stored_event(self._identity, event, recorded_ns)

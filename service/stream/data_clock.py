@@ -2,9 +2,9 @@
 
 from service.stream.liveness import Clocks
 
-_HELD_UP_S = 2.0
+_LONGEST_TICK_S = 2.0
 """Ticks are a fraction of this apart; if not, the program itself stood still."""
-_AGAIN_S = 20.0  # to hear a stream again after a restart: the publishers' cached blocks of all machines come first
+_RESTARTING_S = 20.0  # to hear a stream again after a restart: the publishers' cached blocks of all machines come first
 
 
 class DataClock:
@@ -45,7 +45,7 @@ class DataClock:
     def tick(self) -> None:
         """Take note that time has passed; a standstill of the program is no silence unless one had begun before."""
         now_s = self._clocks.monotonic_s()
-        if now_s - self._ticked_s > _HELD_UP_S and self._ticked_s - self._heard_s < self._limit_s:
+        if now_s - self._ticked_s > _LONGEST_TICK_S and self._ticked_s - self._heard_s < self._limit_s:
             self._held_up_s = now_s
         self._ticked_s = now_s
 
@@ -73,7 +73,7 @@ class DataClock:
 
     @property
     def _limit_s(self) -> float:
-        return max(self._no_data_after_s, _AGAIN_S if self._latest_s is None else 0.0)
+        return max(self._no_data_after_s, _RESTARTING_S if self._latest_s is None else 0.0)
 
     @property
     def _heard_s(self) -> float:

@@ -15,7 +15,7 @@ from service.terminal.logs import Limiter, logger
 _CALM = {HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
 _CALM_NS = 3_600 * 10**9  # between pictures of a machine that nothing is wrong with
 _NOT_KEPT = "predictions are not kept with an alarm"
-_BEFORE = ""  # stands for the alarm's name in the picture of a machine that nothing is wrong with
+_CALM_PICTURE_NAME = ""  # stands for the alarm's name in the picture of a machine that nothing is wrong with
 _log = logger(part="evidence")
 
 
@@ -39,7 +39,7 @@ class EvidenceCollector:
         try:
             if self._generation != self._worker.history.generation:  # the history was begun anew, without pictures
                 self._generation, self._calm_ns = self._worker.history.generation, None
-            elif self._looked_ns is None and (before := self._before()) is not None:
+            elif self._looked_ns is None and (before := self._calm_picture()) is not None:
                 self._calm_ns = before.report.end_ns
             raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}
             self._standing = {key: kept for key, kept in self._standing.items() if key in raised}
@@ -48,15 +48,15 @@ class EvidenceCollector:
                     self._standing[key] = self._keep(self._standing.get(key), alarm, report)
             is_new = self._calm_ns is None or abs(report.end_ns - self._calm_ns) >= _CALM_NS
             if is_new and _is_calm(health, report):
-                self._worker.history.keep_evidence(_BEFORE, 0, self._picture(report).model_dump_json())
+                self._worker.history.keep_evidence(_CALM_PICTURE_NAME, 0, self._picture(report).model_dump_json())
                 self._calm_ns = report.end_ns
             self._looked_ns = report.end_ns
         except RotorwatchError as error:  # tried again at the next look
             place = f"{health.site}/{health.machine}"
             self._limiter.say("", _log.warning, "evidence is not kept yet", machine=place, why=str(error))
 
-    def _before(self) -> Picture | None:
-        text = self._worker.history.evidence(_BEFORE)
+    def _calm_picture(self) -> Picture | None:
+        text = self._worker.history.evidence(_CALM_PICTURE_NAME)
         return Picture.model_validate_json(text) if text else None
 
     def _keep(self, kept: AlarmEvidence | None, alarm: Alarm, report: Report) -> AlarmEvidence | None:
@@ -72,7 +72,7 @@ class EvidenceCollector:
                     machine=report.machine,
                     name=alarm.name,
                     occurrence=alarm.occurrence,
-                    before=self._before(),
+                    before=self._calm_picture(),
                     raised=now,
                     settled=now if settled else None,
                 )

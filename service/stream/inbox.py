@@ -8,7 +8,7 @@ from typing import Literal
 
 from models.signals.wire import sender_of
 
-_MOST_ODD = 16
+_MOST_NON_BLOCKS = 16
 _PATIENCE_S = 0.5
 
 
@@ -64,13 +64,13 @@ class Inbox:
         self._blocks: deque[RawBlock] = deque()
         self._others: deque[RawBlock] = deque()
         self._bytes = 0
-        self._odd: deque[RawBlock] = deque()
+        self._non_blocks: deque[RawBlock] = deque()
         self._followed: tuple[str, str, int | None] | None = None
         self._calls: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._closed = False
         self._enough = 1
-        self._ready = False
+        self._caught_up = False
         self.dropped = 0  # blocks of the publisher that is followed, thrown away because the queue was full
         self.unread = 0  # messages thrown away that could be no blocks, or came from others, because too many came
 
@@ -80,11 +80,11 @@ class Inbox:
 
         Blocks that come many at a time wait even for a worker that is not behind.
         """
-        ready, self._ready = self._ready, False
+        ready, self._caught_up = self._caught_up, False
         return 0 if ready else len(self._blocks)
 
     def __len__(self) -> int:
-        return len(self._blocks) + len(self._others) + len(self._odd)
+        return len(self._blocks) + len(self._others) + len(self._non_blocks)
 
     def follow(self, block: RawBlock) -> None:
         """Follow the publisher of a block that was used."""
@@ -104,10 +104,10 @@ class Inbox:
             if self._closed:
                 return
             if odd:
-                if len(self._odd) >= _MOST_ODD:
+                if len(self._non_blocks) >= _MOST_NON_BLOCKS:
                     self.unread += 1
                     return
-                self._odd.append(block)
+                self._non_blocks.append(block)
             else:
                 if self._wait:
                     self._changed.wait_for(lambda: self._closed or not self._is_full)
@@ -121,12 +121,12 @@ class Inbox:
                     block = self._with_room(block)
                 (self._others if theirs else self._blocks).append(block)
                 self._bytes += len(block.payload)
-            if self._is_worth_it():
+            if self._worker_should_wake():
                 self._changed.notify_all()
 
-    def _is_worth_it(self) -> bool:
+    def _worker_should_wake(self) -> bool:
         """Whether to wake the worker now, rather than wait for more blocks."""
-        others = self._closed or self._calls or self._odd or self._others
+        others = self._closed or self._calls or self._non_blocks or self._others
         return bool(others) or len(self._blocks) >= self._enough or (bool(self._blocks) and self._is_full)
 
     @property
@@ -162,9 +162,9 @@ class Inbox:
         """
         with self._changed:
             if not (self._calls or len(self)):
-                self._ready = True
+                self._caught_up = True
                 self._enough = min(enough, max(1, self._bound // 4))
-                self._changed.wait_for(self._is_worth_it, _PATIENCE_S)
+                self._changed.wait_for(self._worker_should_wake, _PATIENCE_S)
                 self._enough = 1
             self._changed.wait_for(lambda: self._closed or bool(self._calls) or len(self) > 0)
             if self._calls:
@@ -173,7 +173,7 @@ class Inbox:
                 return None
             waiting = self._blocks or self._others
             if not waiting:
-                return self._odd.popleft()
+                return self._non_blocks.popleft()
             block = waiting.popleft()
             self._bytes -= len(block.payload)
             self._changed.notify_all()
@@ -183,6 +183,6 @@ class Inbox:
         """Wake everybody who waits; blocks that are queued are dropped, calls are still made."""
         with self._changed:
             self._closed = True
-            for waiting in (self._blocks, self._others, self._odd):
+            for waiting in (self._blocks, self._others, self._non_blocks):
                 waiting.clear()
             self._changed.notify_all()

@@ -31,7 +31,7 @@ _CACHES = "/@adv/pub/"
 _WITH_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
 # The period has no use, but without one missing blocks would not be fetched at all.
 _WITHOUT_HEARTBEATS = zenoh.ext.RecoveryConfig(periodic_queries=timedelta(days=365), heartbeat=None)  # type: ignore[arg-type]  # the stub says seconds
-_BY_TIME = "uhlc"
+_NUMBERED_BY_TIME = "uhlc"
 """Stands for the number of a publisher whose messages carry times but no numbers."""
 
 
@@ -74,7 +74,7 @@ class BlockSubscription:
         )
         self._missed = self._new.sample_miss_listener(on_missed)
         there = zenoh.handlers.Callback(self._found.append, indirect=False)
-        self._there = session.liveliness().declare_subscriber(f"{key}{_CACHES}**", there, history=True)
+        self._cache_tokens = session.liveliness().declare_subscriber(f"{key}{_CACHES}**", there, history=True)
 
     def take(self, callback: Callable[[zenoh.Sample], None], most: int, *, last: bool = False) -> None:
         """Call back for every block that has come, about `most` at once; from one thread at a time.
@@ -85,7 +85,7 @@ class BlockSubscription:
             found = self._found.popleft()
             _, _, cache = str(found.key_expr).partition(_CACHES)
             if found.kind == zenoh.SampleKind.PUT and "*" not in cache:  # a hostile publisher may send one
-                self._awaited("/".join(cache.split("/")[:2]))
+                self._cached_blocks_of("/".join(cache.split("/")[:2]))
         received = iter(self._new.try_recv, None)
         for _, sample in zip(range(most), received, strict=False):
             origin = _origin(sample)
@@ -93,7 +93,7 @@ class BlockSubscription:
                 callback(sample)
                 continue
             publisher, number = origin
-            if (kept := self._awaited(publisher)) is not None:
+            if (kept := self._cached_blocks_of(publisher)) is not None:
                 kept.new.setdefault(number, sample)
                 continue
             if publisher in self._publishers:  # heard last, forgotten last
@@ -110,7 +110,7 @@ class BlockSubscription:
         for publisher in answered[: -_PUBLISHERS // 2]:
             del self._publishers[publisher]
 
-    def _awaited(self, publisher: str) -> _Kept | None:
+    def _cached_blocks_of(self, publisher: str) -> _Kept | None:
         """Cached blocks to pass on before a publisher's new ones; the cache of an unknown publisher is queried."""
         if publisher not in self._publishers and len(self._publishers) < _PUBLISHERS:
             self._ask(publisher, _Kept())
@@ -118,7 +118,7 @@ class BlockSubscription:
 
     def _join(self, publisher: str, kept: _Kept, most: int, *, waits: bool) -> list[zenoh.Sample]:
         """Blocks of a publisher to pass on now: cached ones and, once they meet them, the new ones."""
-        joined, numbered = _received(publisher, kept, most), not publisher.endswith(_BY_TIME)
+        joined, numbered = _received(publisher, kept, most), not publisher.endswith(_NUMBERED_BY_TIME)
         met = bool(kept.new) and min(kept.new) <= kept.reached + numbered
         if kept.answers is not None and waits and not met:
             return joined
@@ -132,7 +132,7 @@ class BlockSubscription:
 
     def _ask(self, publisher: str, kept: _Kept) -> None:
         kept.questions -= 1
-        numbers = "" if publisher.endswith(_BY_TIME) else f";_sn={kept.reached + 1}.."
+        numbers = "" if publisher.endswith(_NUMBERED_BY_TIME) else f";_sn={kept.reached + 1}.."
         channel: Any = zenoh.handlers.FifoChannel(_WAITING_BLOCKS)
         kept.answers = self._session.get(
             f"{self._key}{_CACHES}{publisher}/**?_max={CACHED_BLOCKS}{numbers}",
@@ -146,7 +146,7 @@ class BlockSubscription:
 
     def close(self) -> None:
         """Receive nothing any more."""
-        self._there.undeclare()  # type: ignore[no-untyped-call]
+        self._cache_tokens.undeclare()  # type: ignore[no-untyped-call]
         self._publishers.clear()  # with the answers still to come
         self._missed.undeclare()  # type: ignore[no-untyped-call]
         self._new.undeclare()  # type: ignore[no-untyped-call]
@@ -182,5 +182,5 @@ def _origin(sample: zenoh.Sample) -> tuple[str, int] | None:
         return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn
     if sample.timestamp is not None:
         time, _, session = str(sample.timestamp).partition("/")
-        return f"{session}/{_BY_TIME}", int(time)
+        return f"{session}/{_NUMBERED_BY_TIME}", int(time)
     return None

@@ -44,8 +44,8 @@ _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
-_DROPPED_US = 1_000_000
-_HELD_UP_US = 2_000_000
+_DROP_AFTER_US = 1_000_000
+_CLOSE_AFTER_US = 2_000_000
 """How long a subscriber may hold up a link. With Zenoh's default of five seconds, the silence after which a stream is
 called lost, the streams of other machines would be called lost."""
 
@@ -319,8 +319,8 @@ def relay_items(*, waits: bool) -> dict[str, str]:
     source; otherwise it is cut off, and when it comes again it gets what it missed from publishers with a cache.
     """
     place = "transport/link/tx/queue/congestion_control"
-    cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_HELD_UP_US)}
-    return {f"{place}/drop/wait_before_drop": str(_DROPPED_US)} | cut_off
+    cut_off = {} if waits else {f"{place}/block/wait_before_close": str(_CLOSE_AFTER_US)}
+    return {f"{place}/drop/wait_before_drop": str(_DROP_AFTER_US)} | cut_off
 
 
 @contextmanager

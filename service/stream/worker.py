@@ -42,7 +42,7 @@ from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger
 
 _OPERATION_S = 10.0
-_SEEN_S = 0.5  # longest time until other threads see what a block changed, if more blocks wait
+_LONGEST_UNSEEN_S = 0.5  # longest time until other threads see what a block changed, if more blocks wait
 _LATEST = 100
 _LONGEST_ERROR = 500
 
@@ -87,7 +87,7 @@ class MachineWorker:
         self.history = history
         self.identity = identity_of(installed)
         self.snapshots = MachineSnapshots(installed, self.identity)
-        self._held: Callable[[], LatestData] = LatestData
+        self._make_latest: Callable[[], LatestData] = LatestData
         self.errors = 0
         self.last_error = ""
         self.recorder: MachineRecorder | None = None
@@ -317,7 +317,7 @@ class MachineWorker:
             if self._recorded_since_ns is not None:
                 self._catch_up(self._recorded_since_ns)
         except Exception as error:  # a defect that it brings to light must not end the monitoring of the machine
-            self._failed(error)
+            self._note_error(error)
         self._monitor.begin()
         self._shedding = LoadShedding() if self._sheds else None  # only now: recorded windows are never skipped
         while (item := self.inbox.get(self._monitor.blocks_to_hop)) is not None:
@@ -327,25 +327,25 @@ class MachineWorker:
                 else:
                     item()
             except Exception as error:  # one bad block must not end the monitoring of the machine
-                self._failed(error)
-                self._fault(f"{type(error).__name__}: {error}")
+                self._note_error(error)
+                self._raise_fault(f"{type(error).__name__}: {error}")
         # An orderly end saves the state up to the last block, so that a restart needs no publisher's cache.
         self._conclude((), (), whole=True)
 
-    def _failed(self, error: Exception) -> None:
+    def _note_error(self, error: Exception) -> None:
         self.errors += 1
         self.last_error = f"{type(error).__name__}: {error}"[:_LONGEST_ERROR]
         if (withheld := self._limiter.admit("error")) is not None:
             self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
 
-    def _fault(self, what: str) -> None:
+    def _raise_fault(self, what: str) -> None:
         """Raise the alarm on the monitor itself, once."""
         try:
             events = self._monitor.fault(what, self._data_now_ns())
             if events:
                 self._conclude((), events)
         except Exception as error:  # can only be counted and logged
-            self._failed(error)
+            self._note_error(error)
 
     def _take(self, block: RawBlock) -> None:
         with in_turn(completes_hop=self._monitor.blocks_to_hop == 1):
@@ -360,12 +360,12 @@ class MachineWorker:
     def _conclude_reports(self, reports: Sequence[MonitorReport]) -> None:
         """Conclude all reports on one message in one step: the monitor's state is that after the last block."""
         for report in reports:
-            self._explain(report)
+            self._log_admission(report)
             if report.verdict.accepted:
                 self._time.came(continuous=report.verdict.continuous)
                 self.tally.data_s += report.data_s
             if report.fault is not None:
-                self._failed(report.fault)
+                self._note_error(report.fault)
             evaluated = any(not one.skipped for one in report.windows) and report.fault is None
             self._unevaluated_s = 0.0 if evaluated else self._unevaluated_s + report.data_s
         self._conclude(
@@ -379,7 +379,7 @@ class MachineWorker:
         """Commit windows and events, then replace the snapshot and publish."""
         events += self._monitor.take_events()  # left behind by a defect
         now_s, news = self._clocks.monotonic_s(), bool(windows or events or always or whole)
-        if not news and len(self.inbox) and now_s - self._seen_s < _SEEN_S:
+        if not news and len(self.inbox) and now_s - self._seen_s < _LONGEST_UNSEEN_S:
             return
         self._seen_s = now_s
         self.steps.owe(events)
@@ -391,7 +391,7 @@ class MachineWorker:
                 reports, told = self._commit(windows, whole=whole)
         finally:
             self._snapshot = snapshot
-            self._held = partial(held_now, self._monitor.window, snapshot, self._monitor.blocks)
+            self._make_latest = partial(held_now, self._monitor.window, snapshot, self._monitor.blocks)
         texts = tuple(one.text for one in told if one.sequence >= self.told)
         for event in events:
             self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
@@ -401,9 +401,9 @@ class MachineWorker:
         try:
             self._publish([one.text for one in reports], texts)
         except Exception as error:  # the network's, of whatever kind; subscribers query events that they lack
-            self._failed(error)
+            self._note_error(error)
         if self.steps.refused is not None:
-            self._fault(f"the history refuses what happens: {self.steps.refused}")
+            self._raise_fault(f"the history refuses what happens: {self.steps.refused}")
 
     def _commit(
         self, windows: tuple[Report, ...], *, whole: bool
@@ -412,7 +412,7 @@ class MachineWorker:
         begin_s = self._clocks.monotonic_s()
         reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns(), whole=whole)
         if self.steps.refused is not None:
-            self._failed(self.steps.refused)
+            self._note_error(self.steps.refused)
         elif not written:
             self._warn("history", "the history cannot be written; events wait in memory and are published")
         self.tally.windows += sum(not one.skipped for one in windows)
@@ -422,7 +422,7 @@ class MachineWorker:
     @property
     def latest(self) -> LatestData:
         """Latest data of the monitor, for snapshots; the window is computed when somebody looks at it."""
-        return self._held()
+        return self._make_latest()
 
     def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
         outlet = self._outlet
@@ -441,7 +441,7 @@ class MachineWorker:
             self._published_alarms = now
             outlet("alarm_state", self.alarms().model_dump_json())
 
-    def _explain(self, report: MonitorReport) -> None:
+    def _log_admission(self, report: MonitorReport) -> None:
         verdict = report.verdict
         if verdict.reason is not None:
             self._warn(f"refused {verdict.reason}", "block refused", reason=verdict.reason.value, why=verdict.text)
