@@ -24,9 +24,9 @@ from models.signals.block import FloatArray
 LEFT_OUT_BINS = 3
 """Lines on either side of 1× that are excluded: the remainder of 1× there is not stochastic."""
 _GROUPS = 150
-_HELD = 1e9
+_FIXING_RIDGE = 1e9
 _STEPS, _NEAR, _GAIN = 60, 0.15, 3.0
-_SMOOTH = 2000.0
+_COLOUR_RIDGE = 2000.0
 """Ridge strength on the forces' own colours: keeps them close to one common colour unless the window says otherwise."""
 
 
@@ -108,8 +108,8 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     force_scale = usual_force(machine, motions, groups, speed, usual_cutoff_hz)
     model = SpectralModel(machine, motions, groups, force_scale)
     observed = motions.spectra(groups.average(window.spectrum), model.centre)
-    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _SMOOTH)
-    search.weights.ridge[: model.cutoff_at] = _HELD
+    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _COLOUR_RIDGE)
+    search.weights.ridge[: model.cutoff_at] = _FIXING_RIDGE
     try:
         # Trial points may overflow: the result is checked below, so no warnings are needed.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -157,10 +157,10 @@ def _order(state: str) -> int:
 
 
 _NOISE_STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
-_STEEPEST = 4.0
+_MOST_NOISE_SLOPE = 4.0
 _LEAST, _USUAL = 1e-7, 1e-3
 """Noise density over the channel's mean density: lower bound of the search, and starting point."""
-_PULL = np.array([0.05, 1.0])
+_NOISE_PRIOR_PRECISION = np.array([0.05, 1.0])
 """Prior precision of ln d₀ and b about their usual values: weak, for sensors whose noise is not visible."""
 
 
@@ -187,17 +187,17 @@ def _sensor_noise(measured: FloatArray, theory: FloatArray, averages: FloatArray
         noise = np.exp(point[0] + point[1] * shape)
         expected = theory + noise
         fits = -float(averages @ (np.log(expected) + measured / expected))
-        return noise, expected, fits - float(_PULL @ (point - usual) ** 2) / 2
+        return noise, expected, fits - float(_NOISE_PRIOR_PRECISION @ (point - usual) ** 2) / 2
 
     found, damping = usual, 1e-3
     noise, expected, value = seen(found)
     for _ in range(_NOISE_STEPS):
         slopes = np.stack([noise / expected, shape * noise / expected])
-        gradient = slopes @ (averages * (measured / expected - 1)) - _PULL * (found - usual)
-        information = (slopes * averages) @ slopes.T + np.diag(_PULL)
+        gradient = slopes @ (averages * (measured / expected - 1)) - _NOISE_PRIOR_PRECISION * (found - usual)
+        information = (slopes * averages) @ slopes.T + np.diag(_NOISE_PRIOR_PRECISION)
         step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
         step = np.clip(step, -_LONGEST, _LONGEST)
-        trial = np.clip(found + step, (level + np.log(_LEAST), -_STEEPEST), (level, _STEEPEST))
+        trial = np.clip(found + step, (level + np.log(_LEAST), -_MOST_NOISE_SLOPE), (level, _MOST_NOISE_SLOPE))
         there = seen(trial)
         if there[2] > value:
             found, (noise, expected, value), damping = trial, there, damping / 8

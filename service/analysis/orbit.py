@@ -22,7 +22,7 @@ _UM = 1e6
 _LONGEST_S = 3600.0
 _AT_1X = 1
 """Index of 1x among the orders of `Vectors`."""
-_AT_ONCE = 2
+_REVOLUTIONS_AT_ONCE = 2
 """Revolutions per vector: in two, the orders (from 0.5x on) do not leak into each other."""
 
 
@@ -231,7 +231,7 @@ def orbits_of(excerpt: Excerpt, pairs: list[tuple[Channel, Channel]], revolution
             f"before this time ({excerpt.length_s:.3g} s of samples)"
         )
     channels = [channel for pair in pairs for channel in pair]
-    vectors = vectors_of(path, channels, _AT_ONCE)
+    vectors = vectors_of(path, channels, _REVOLUTIONS_AT_ONCE)
     q_um = _UM * np.average(vectors.orders[:, _AT_1X], axis=0, weights=vectors.revolutions)
     about = path.samples * (_UM * np.array([channel.to_si for channel in channels]))
     about -= about.mean(axis=0)

@@ -6,7 +6,7 @@ from rotorwatch.records.health import Health, Report
 from rotorwatch.records.levels import ChannelLevels, LevelLimits
 from rotorwatch.records.windows import Parameter
 
-_BEYOND = {"normal": 0.0, "alert": 10.0, "danger": 20.0}
+_NEARNESS_OF_STATE = {"normal": 0.0, "alert": 10.0, "danger": 20.0}
 
 
 def overview(health: Health) -> Health:
@@ -70,6 +70,6 @@ def _level_nearness(levels: ChannelLevels) -> float:
 
     def of_limit(limit: LevelLimits) -> float:
         value = getattr(levels, limit.measure, None)
-        return _BEYOND[limit.state] + (value / limit.alert if limit.alert and value is not None else 0.0)
+        return _NEARNESS_OF_STATE[limit.state] + (value / limit.alert if limit.alert and value is not None else 0.0)
 
     return max(map(of_limit, levels.limits), default=0.0)

@@ -29,7 +29,7 @@ NO_PARAMETERS = "the machine's parameters are not known, so there is no theory t
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _HALF_WIDTHS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
 """Panel edges on either side of a natural frequency, in units of half its half-power bandwidth."""
-_CYCLES = 1.2
+_MOST_PANEL_CYCLES = 1.2
 """Largest width of a panel times the longest lag, i.e. periods of e^{-2πjfτ} in one panel."""
 _GROWTH = 0.05
 _OVER_BAND = 4.0
@@ -133,7 +133,7 @@ def _nodes(
     poles = poles[poles.imag > 0]
     modes_hz, half_hz = poles.imag / (2 * np.pi), np.maximum(-poles.real / (2 * np.pi), 1e-9)
     around = (modes_hz[:, None] + half_hz[:, None] * np.concatenate([-_HALF_WIDTHS[:0:-1], _HALF_WIDTHS])).ravel()
-    widest_hz = _CYCLES / max(longest_s, 1 / excitation.machine.window.band_hz[1])
+    widest_hz = _MOST_PANEL_CYCLES / max(longest_s, 1 / excitation.machine.window.band_hz[1])
     even, at = [low_hz], low_hz
     beyond_hz = _OVER_BAND * excitation.machine.window.band_hz[1]
     while at < high_hz:

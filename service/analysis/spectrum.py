@@ -16,8 +16,8 @@ from service.analysis.revolutions import Excerpt
 
 _MOST_SPECTRA = 400
 _MOST_SPEEDS = 120
-_STEADY = 0.02
-_STANDS_HZ = 0.5
+_MOST_SPEED_RANGE = 0.02
+_LEAST_ROTATION_HZ = 0.5
 _NYQUIST_OVER_SHOWN = 1.28
 """Analysers show spectra up to the sampling rate divided by 2.56."""
 
@@ -31,9 +31,9 @@ _SHOWN = {
     "m/s2": ("m/s²", 1.0),
     "in/s2": ("in/s²", 1.0),
 }
-_SWINGS = (Quantity.DISPLACEMENT, Quantity.TILT)
-_CLEAR_OF_MEAN = 2
-_SHARE = 0.999
+_PEAK_TO_PEAK_QUANTITIES = (Quantity.DISPLACEMENT, Quantity.TILT)
+_MEAN_LOBE_LINES = 2
+_SHOWN_POWER_SHARE = 0.999
 _HIGHEST_ORDER = 4
 _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 
@@ -52,7 +52,7 @@ def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
     unit, factor = unit_shown(channel)
     if scaling == "density":
         return (f"({unit})²/Hz" if "/" in unit or "²" in unit else f"{unit}²/Hz"), factor**2
-    if channel.quantity in _SWINGS:
+    if channel.quantity in _PEAK_TO_PEAK_QUANTITIES:
         return f"{unit} p-p", 2 * factor
     return f"{unit} rms", float(factor / np.sqrt(2))
 
@@ -155,7 +155,7 @@ class Waterfall:
 def steady(speed_rad_s: FloatArray) -> str:
     """Message that the speed stays nearly the same; empty if it does not."""
     slowest, fastest = (float(one(np.abs(speed_rad_s))) for one in (np.min, np.max))
-    if fastest - slowest >= _STEADY * max(fastest, 1e-9):
+    if fastest - slowest >= _MOST_SPEED_RANGE * max(fastest, 1e-9):
         return ""
     low, high = f"{slowest * 30 / np.pi:.4g}", f"{fastest * 30 / np.pi:.4g}"
     return f"the speed stays {f'at {low}' if low == high else f'between {low} and {high}'} rpm"
@@ -230,7 +230,7 @@ def read_full_spectrum(
     start_ns, end_ns = used[0].start_ns, used[-1].end_ns
     if orders:
         turns_hz = abs(speed_rad_s) / (2 * np.pi)
-        if turns_hz < _STANDS_HZ:
+        if turns_hz < _LEAST_ROTATION_HZ:
             raise RotorwatchError(f"{data.place}: --axis orders needs a shaft that turns, and it stands still")
         each = int(np.ceil(data.descriptor.rate_hz / turns_hz))
         used = [_at_equal_angles(stretch, each) for stretch in used]
@@ -337,7 +337,7 @@ def _mean_power(
 
 def lowest_hz(resolution_hz: float) -> float:
     """Lowest frequency that the mean does not reach through the main lobe of the Hann window."""
-    return _CLEAR_OF_MEAN * resolution_hz
+    return _MEAN_LOBE_LINES * resolution_hz
 
 
 def _useful_hz(frequencies_hz: FloatArray, values: FloatArray, scaling: Scaling, speed_rad_s: float) -> float:
@@ -347,7 +347,7 @@ def _useful_hz(frequencies_hz: FloatArray, values: FloatArray, scaling: Scaling,
     """
     resolved = frequencies_hz >= lowest_hz(float(frequencies_hz[1]))
     power = np.cumsum((values if scaling == "density" else values**2) * resolved)
-    reached_hz = float(frequencies_hz[np.searchsorted(power, _SHARE * power[-1])])
+    reached_hz = float(frequencies_hz[np.searchsorted(power, _SHOWN_POWER_SHARE * power[-1])])
     turns_hz = abs(speed_rad_s) / (2 * np.pi) if np.isfinite(speed_rad_s) else 0.0
     wanted_hz = max(1.5 * reached_hz, _HIGHEST_ORDER * turns_hz, 8 * float(frequencies_hz[1]))
     decade = 10.0 ** np.floor(np.log10(wanted_hz))

@@ -19,9 +19,9 @@ from service.analysis.revolutions import Excerpt, pulses
 
 _LONGEST_S = 20.0
 _ESTIMATED_S = 2.0
-_STANDS_OUT = 15.0
+_LEAST_LINE_STRENGTH = 15.0
 """Least strength of a line over its surroundings: noise reaches 3 to 8 in 2 s (`models.diagnosis.window.rotation`)."""
-_FOLLOWS, _FOLLOWS_S = 0.05, 2.5 * _ESTIMATED_S
+_MOST_SPEED_STEP, _LONGEST_STEP_S = 0.05, 2.5 * _ESTIMATED_S
 """Largest difference between consecutive lines of one shaft: relative speed, and time in s."""
 
 
@@ -102,8 +102,8 @@ def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s:
         for stretch in data.stretches(channels, _ESTIMATED_S)
     )
     if found is not None:
-        near = (np.diff(found.time_ns) < _FOLLOWS_S * 1e9) & (
-            np.abs(np.diff(found.speed_rad_s)) < _FOLLOWS * found.speed_rad_s[1:]
+        near = (np.diff(found.time_ns) < _LONGEST_STEP_S * 1e9) & (
+            np.abs(np.diff(found.speed_rad_s)) < _MOST_SPEED_STEP * found.speed_rad_s[1:]
         )
         follows = np.append(near, False) | np.insert(near, 0, False)
         found = Vectors(*(getattr(found, field.name)[follows] for field in fields(Vectors))) if follows.any() else None
@@ -118,7 +118,7 @@ def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s:
 def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float, tolerance: float) -> Vectors | None:
     si = stretch.samples * np.array([channel.to_si for channel in channels])
     line = rotation_line(si.T, stretch.rate_hz, speed_rad_s, tolerance)
-    if line is None or line.strength <= _STANDS_OUT:
+    if line is None or line.strength <= _LEAST_LINE_STRENGTH:
         return None
     t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
     plan = level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz))

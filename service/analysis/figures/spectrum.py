@@ -86,13 +86,13 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
     count = len(found.channels)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    limits_hz, shown = _shown(found, lines.to_hz)
+    limits_hz, shown = _line_limits(found, lines.to_hz)
     frequency = found.frequencies_hz[shown]
     for axes, channel, values in zip(panels, found.channels, found.values[:, shown], strict=True):
         axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
         axes.set_title(f"{channel.name}   {place_text(channel)}", fontweight="bold")
         axes.set_ylabel(shown_as(channel, found.scaling)[0])
-        _heights(axes, values, _depth(found) if lines.log else None, 1.15)
+        _heights(axes, values, _dynamic_range(found) if lines.log else None, 1.15)
         _orders(axes, found, values, frequency, channel)
     panels[-1].set_xlim(limits_hz)
     panels[-1].set_xlabel("frequency, Hz")
@@ -115,7 +115,7 @@ def paint_waterfall(
     """Draw spectra as a colour map, or as a cascade of lines."""
     figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), dpi=look.dpi, layout="constrained")
     axes = figure.subplots()
-    limits_hz, shown = _shown(found, lines.to_hz)
+    limits_hz, shown = _line_limits(found, lines.to_hz)
     axes.set_xlim(limits_hz)
     axes.set_xlabel("frequency, Hz")
     axes.grid(visible=False)
@@ -148,7 +148,7 @@ def _map(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over_spe
     first = np.arange(0, frequency.size, group)
     columns, values = np.append(columns[first], columns[-1]), np.fmax.reduceat(values, first, axis=1)
     top = float(np.nanmax(values)) or 1.0
-    norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _depth(found)), top)
+    norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _dynamic_range(found)), top)
     limits = axes.get_xlim()
     mesh = axes.pcolormesh(
         columns, rows, values, norm=norm if log else Normalize(0, top), cmap="cividis", rasterized=True
@@ -255,7 +255,7 @@ def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: 
         )  # fmt: skip
 
 
-def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
+def _line_limits(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
     """Limits of the frequency axis, Hz, and a mask of the lines between them."""
     low, high = lowest_hz(found.resolution_hz), found.useful_hz if to_hz is None else to_hz
     high = min(high, float(found.frequencies_hz[-1]))
@@ -263,7 +263,7 @@ def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[floa
     return (low, high), (found.frequencies_hz >= low - slack) & (found.frequencies_hz <= high + slack)
 
 
-def _depth(found: Spectrum | Waterfall | FullSpectrum) -> float:
+def _dynamic_range(found: Spectrum | Waterfall | FullSpectrum) -> float:
     """Ratio of the smallest to the greatest height shown on a logarithmic scale: 80 dB."""
     density = not isinstance(found, FullSpectrum) and found.scaling == "density"
     return float(10.0 ** (-2 * _DECADES if density else -_DECADES))
@@ -301,7 +301,7 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
         axes.axvline(0, color=INK, linewidth=0.8)
         axes.set_title(f"{pair[0].location}   {' and '.join(one.name for one in pair)}", fontweight="bold")
         axes.set_ylabel("µm p-p")
-        _heights(axes, values[clear], _depth(found) if lines.log else None, 1.22)
+        _heights(axes, values[clear], _dynamic_range(found) if lines.log else None, 1.22)
         _sides(axes, known=known)
         _marks(axes, found, values, shown)
     panels[-1].set_xlim(-to, to)

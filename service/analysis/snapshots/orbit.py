@@ -73,9 +73,9 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         **head,
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
-            _place(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places
+            _window_orbit(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places
         )
-        + tuple(_elsewhere(pair, path.excerpt, samples, units) for pair, samples in others if samples is not None),
+        + tuple(_path_orbit(pair, path.excerpt, samples, units) for pair, samples in others if samples is not None),
         revolutions=path.count,
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
         pulses_s=known_figures(path.pulses / machine.rate_hz),
@@ -94,7 +94,7 @@ def _vectors(window: WindowStatistics) -> _Vectors | None:
     return _Vectors(seen.mean(axis=0), seen, 1, absolute=False) if seen.shape[0] else None
 
 
-def _place(
+def _window_orbit(
     pair: tuple[Channel, Channel],
     window: WindowStatistics | None,
     vectors: _Vectors | None,
@@ -122,7 +122,7 @@ def _place(
     )
 
 
-def _elsewhere(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: PathSamples, units: Units) -> PlaceOrbit:
+def _path_orbit(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: PathSamples, units: Units) -> PlaceOrbit:
     """Orbit of the newest revolutions at a location that neither the model nor the window has."""
     ellipse = None
     if excerpt is not None and excerpt.angle_rad is not None:

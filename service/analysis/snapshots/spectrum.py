@@ -27,7 +27,7 @@ from service.analysis.snapshots.heading import LatestData, Subject, heading, no_
 
 MOST_LINES = 1000
 """Most lines in a snapshot; if the band has more, adjacent lines are averaged."""
-_SHARED = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
+_SEGMENT_CORRELATIONS = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
 """Sums of squared correlations of half-overlapping Hann segments' power: in one line, and in lines 1 and 2 apart."""
 _OUTER = (0.025, 0.975)
 _Array = TypeVar("_Array", FloatArray, ComplexArray)
@@ -155,8 +155,8 @@ def _grouped(values: _Array, group: int) -> _Array:
 
 def _averages(n_segments: int, group: int) -> float:
     """Effective number of independent averages in one line, or in `group` averaged lines."""
-    near = sum(2 * (1 - apart / group) * _SHARED[apart] for apart in (1, 2) if apart < group)
-    return n_segments * group / (_SHARED[0] + near)
+    near = sum(2 * (1 - apart / group) * _SEGMENT_CORRELATIONS[apart] for apart in (1, 2) if apart < group)
+    return n_segments * group / (_SEGMENT_CORRELATIONS[0] + near)
 
 
 def _density(channel: Channel, at: int, spectra: _Spectra, spacing_hz: float, units: Units) -> ChannelDensity:
