@@ -61,7 +61,7 @@ class Plant:
         self._rng = rng
         self._n_sources = len(condition.sources)
         self._A = np.empty((0, 0))
-        self._set(condition)
+        self._set_condition(condition)
         self._start_revolution = 0.0
         self._since_change = 0
         covariance = stationary_covariance(self._A, expanded_B(condition.sources))
@@ -88,7 +88,7 @@ class Plant:
         if condition.speed_rpm != self._speed_rpm:
             self._start_revolution = theta / (2 * np.pi)
             self._since_change = 0
-        self._set(condition)
+        self._set_condition(condition)
         state[:12] -= self._synchronous(np.array([theta]))[0]
         self._d = state
 
@@ -110,7 +110,7 @@ class Plant:
         # All noise of the discrete system comes from the white drives, so their level scales it exactly.
         return noise if self._level == 1 else noise * self._level
 
-    def _set(self, condition: Condition) -> None:
+    def _set_condition(self, condition: Condition) -> None:
         self._level = condition.excitation_level
         rotor = rotor_in(self._machine, condition)
         speed_rad_s = condition.speed_rpm * 2 * np.pi / 60
@@ -260,8 +260,8 @@ class NonlinearPlant(Plant):
         self._since_change += n_samples
         return PlantSamples(steady + rest[:-1, :12], theta)
 
-    def _set(self, condition: Condition) -> None:
-        super()._set(condition)
+    def _set_condition(self, condition: Condition) -> None:
+        super()._set_condition(condition)
         rotor = rotor_in(self._machine, condition)
         depth, stiffness = condition.anomalies.get("crack", 0.0), condition.anomalies.get("rub", 0.0)
         self._crack = self._periodic(rotor, depth, condition) if depth else None

@@ -32,7 +32,7 @@ _CACHE_BLOCKS = 1200  # two minutes in blocks of 0.1 s: a window, and the time t
 _CACHE_TRUTH = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02
-_HEARD_S = 2.0
+_SUBSCRIBER_CHECK_S = 2.0
 _BLOCKED_US = 20_000_000
 
 
@@ -193,7 +193,7 @@ def _send(
     summary = RunSummary()
     first_ns: int | None = None
     begin = time.monotonic()
-    look_s, heard = _HEARD_S, None
+    look_s, heard = _SUBSCRIBER_CHECK_S, None
     for block, truth in stream:
         first_ns = block.start_ns if first_ns is None else first_ns
         data_s = (block.end_ns - first_ns) / 1e9
@@ -207,7 +207,7 @@ def _send(
         outlets.stream.put(payload, attachment=attachment or None, encoding=encoding)
         elapsed_s = time.monotonic() - begin
         if elapsed_s >= look_s:
-            look_s, heard = elapsed_s + _HEARD_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+            look_s, heard = elapsed_s + _SUBSCRIBER_CHECK_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
         summary = RunSummary(
             blocks=summary.blocks + 1,
             data_s=data_s,

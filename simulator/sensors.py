@@ -52,7 +52,7 @@ class SimulatedSensor:
         self._memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / rate_hz))
         self._noise: float | None = None
         self._ahead: FloatArray = np.empty(0)
-        self._held: float | None = None
+        self._last_value: float | None = None
         self._rate_hz, self._reach = rate_hz, round(longest_delay_s * rate_hz)
         self._past: FloatArray | None = None
         angle = channel.quantity is Quantity.SHAFT_ANGLE
@@ -63,11 +63,11 @@ class SimulatedSensor:
     def noise(self, n_samples: int) -> FloatArray:
         """Take the next samples of noise of unit variance (white or exact first-order), shape (n_samples,)."""
         if self._ahead.size < n_samples:  # a filter takes as long to be set up as for thousands of samples
-            self._ahead = np.concatenate([self._ahead, self._drawn(max(n_samples - self._ahead.size, _AHEAD))])
+            self._ahead = np.concatenate([self._ahead, self._draw_noise(max(n_samples - self._ahead.size, _AHEAD))])
         taken, self._ahead = self._ahead[:n_samples], self._ahead[n_samples:]
         return taken
 
-    def _drawn(self, n_samples: int) -> FloatArray:
+    def _draw_noise(self, n_samples: int) -> FloatArray:
         white = self._rng.standard_normal(n_samples)
         if self._memory == 0:
             return white
@@ -82,7 +82,7 @@ class SimulatedSensor:
         """Turn true values, while the same faults are active, into samples in the channel's unit; NaN in a dropout."""
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
-        seen = self._delayed(self._passed(value_SI), round(_value(faults, "delay", 0.0) * self._rate_hz))
+        seen = self._delayed(self._pass_filter(value_SI), round(_value(faults, "delay", 0.0) * self._rate_hz))
         seen = seen + level * noise
         seen = seen * settings.gain * _value(faults, "gain", 1.0) + settings.offset_SI + _value(faults, "offset", 0.0)
         if "clip" in faults:
@@ -91,13 +91,13 @@ class SimulatedSensor:
         if settings.step_SI > 0:
             seen = np.round(seen / settings.step_SI) * settings.step_SI
         if "stuck" in faults:
-            seen = np.full_like(seen, seen[0] if self._held is None else self._held)
-        self._held = float(seen[-1])
+            seen = np.full_like(seen, seen[0] if self._last_value is None else self._last_value)
+        self._last_value = float(seen[-1])
         if "dropout" in faults:
             return np.full_like(seen, np.nan)
         return np.asarray(seen / self.channel.to_si, dtype=np.float64)
 
-    def _passed(self, value_SI: FloatArray) -> FloatArray:
+    def _pass_filter(self, value_SI: FloatArray) -> FloatArray:
         """Pass values through the high-pass and the delay of the file, as if constant before the first sample."""
         if self._filter is None:
             return value_SI
@@ -149,7 +149,7 @@ class SensorBank:
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)
         for column, sensor in enumerate(self._sensors):
             angle = sensor.channel.quantity is Quantity.SHAFT_ANGLE
-            value = _ago(plant.theta_rad, sensor.late) if angle else _seen(sensor.channel, plant.states)
+            value = _delayed_angle(plant.theta_rad, sensor.late) if angle else _measured(sensor.channel, plant.states)
             noise = sensor.noise(n_samples)
             for begin, end, faults in self._stretches(sensor.channel.name, first, n_samples):
                 samples[begin:end, column] = sensor.measure(value[begin:end], noise[begin:end], faults)
@@ -183,7 +183,7 @@ class SensorBank:
         return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]
 
 
-def _ago(angle_rad: FloatArray, late: float) -> FloatArray:
+def _delayed_angle(angle_rad: FloatArray, late: float) -> FloatArray:
     """Shaft angle `late` samples earlier, extrapolated at the present speed."""
     if not late or angle_rad.size < 2:
         return angle_rad
@@ -220,7 +220,7 @@ def _value(faults: SensorFaults, kind: str, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _seen(channel: Channel, states: FloatArray) -> FloatArray:
+def _measured(channel: Channel, states: FloatArray) -> FloatArray:
     """What a channel measures of states, shape (..., 12); channels at an angle measure two of them."""
     parts = [(STATE_INDEX[state], part) for state, part in parts_seen(channel).items()]
     if len(parts) == 1:
@@ -231,7 +231,7 @@ def _seen(channel: Channel, states: FloatArray) -> FloatArray:
 def _reference(channel: Channel, moments: FloatArray) -> float:
     if channel.quantity is Quantity.SHAFT_ANGLE:
         return _TURN
-    return float(np.sqrt(_seen(channel, _seen(channel, moments))))
+    return float(np.sqrt(_measured(channel, _measured(channel, moments))))
 
 
 def _wrapped(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:

@@ -123,7 +123,7 @@ def commission_machine(
     """
     machine = load_machine_file(name)
     _check_names(healthy)
-    replaces = _before(out, machine, why)
+    replaces = _load_replaced(out, machine, why)
     with labelled_bars() as progress:
         recordings = []
         for number, path in enumerate(healthy, start=1):
@@ -152,7 +152,7 @@ def _check_names(paths: Sequence[Path]) -> None:
             raise MachineFileError(f"--healthy {path}: two recordings are called {path.name}, expected different names")
 
 
-def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
+def _load_replaced(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
     """Load the commissioning that is replaced, if there is one; this needs a reason, so that none is by accident."""
     if not (out / FILE).is_file():
         return None

@@ -107,7 +107,7 @@ class SpectralDraws:
         for _ in range(count):
             A[..., below[0], below[1]] = _complex_normal(rng, (n_windows, n_bins + 2, below[0].size))
             A[..., diagonal, diagonal] = np.sqrt(rng.standard_gamma(freedom))
-            white = self._mixed(A @ A.conj().swapaxes(-1, -2)) / np.float32(self._averages)
+            white = self._hann_smoothed(A @ A.conj().swapaxes(-1, -2)) / np.float32(self._averages)
             yield L @ white @ L_adjoint
 
     def scattered_vectors(self, rng: np.random.Generator, conditions: DrawnConditions) -> ComplexArray:
@@ -155,7 +155,7 @@ class SpectralDraws:
             S[number] *= factor
             S[number] += self._noise(rng, power * factor + synchronous, frequencies)
         scatter = _factor(S[:, -1] * (4 / self._duration_s))
-        return log_ratio, np.tile(centre, (n, 1)), np.full(n, speed), self._mixed(S[:, :-1]), q, scatter
+        return log_ratio, np.tile(centre, (n, 1)), np.full(n, speed), self._hann_smoothed(S[:, :-1]), q, scatter
 
     def _sources(self, rng: np.random.Generator, frequencies: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Directions of the sources, shape (6, n_sources), and their spectra, shape (n_frequencies, n_sources)."""
@@ -193,7 +193,7 @@ class SpectralDraws:
         return np.asarray(density[:, :, None] * np.eye(n), dtype=np.float64)
 
     @staticmethod
-    def _mixed(S: _Complex) -> _Complex:
+    def _hann_smoothed(S: _Complex) -> _Complex:
         mixed: _Complex = _HANN[0] * S[:, :-2] + _HANN[1] * S[:, 1:-1] + _HANN[2] * S[:, 2:]
         return mixed
 
@@ -244,7 +244,7 @@ class FeatureDraws:
         parts = []
         for _ in range(0, _BASIS_DRAWS, _AT_ONCE):
             drawn = draws.draw(rng, _AT_ONCE)
-            parts += [one.series(one.force(drawn.spectrum[own])) for own, one in _through(machine, drawn.centre, near)]
+            parts += [one.series(one.force(drawn.spectrum[own])) for own, one in _centres(machine, drawn.centre, near)]
         kept = _KEPT_NEAR if near else KEPT
         return cls(machine, seed, conditions, *principal_directions(np.concatenate(parts, axis=1), kept), near)
 
@@ -276,7 +276,7 @@ class FeatureDraws:
         self, rng: np.random.Generator, draws: SpectralDraws, conditions: DrawnConditions
     ) -> list[Float32Array]:
         speed, n_kept = conditions.speed_rad_s, self.directions.shape[2]
-        through = list(_through(self.machine, conditions.centre, self.near))
+        through = list(_centres(self.machine, conditions.centre, self.near))
         features = through[0][1]
         expected = np.concatenate([one.force(conditions.spectrum[own]) for own, one in through])
         centre = conditions.centre.astype(np.float32)[:, : len(PARAMETERS) if self.near else 0]
@@ -297,7 +297,7 @@ class FeatureDraws:
         return windows
 
 
-def _through(machine: Machine, centre: FloatArray, near: bool) -> Iterator[tuple[slice, ForceFeatures]]:
+def _centres(machine: Machine, centre: FloatArray, near: bool) -> Iterator[tuple[slice, ForceFeatures]]:
     """Slices of windows with the same centre, and the features of the machine at that centre."""
     starts = [0, *(np.flatnonzero(np.any(np.diff(centre, axis=0) != 0, axis=1)) + 1), len(centre)]
     for first, end in pairwise(starts):
