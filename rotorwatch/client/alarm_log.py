@@ -18,7 +18,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 _PAGE = 500
 _QUEUED = 10_000
 _STOP_S = 0.25
-_HOLE_S = 0.1
+_WAIT_FOR_MISSING_S = 0.1
 
 _log = logging.getLogger("rotorwatch.client")
 
@@ -132,7 +132,7 @@ class _Follower:
         self._hand_over(order)
         if order.incomplete:
             # Wait a moment before asking the log: the missing events may still arrive.
-            self._due_s[message.place] = min(self._due_s[message.place], time.monotonic() + _HOLE_S)
+            self._due_s[message.place] = min(self._due_s[message.place], time.monotonic() + _WAIT_FOR_MISSING_S)
 
     def _ask(self, topics: AlarmTopics, order: LogOrder) -> None:
         """Read the log up to its end."""

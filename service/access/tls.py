@@ -69,10 +69,10 @@ def lapses(settings: ServiceSettings) -> list[str]:
     """Certificates of a monitor that have expired, or do so within a month: clients refuse them then."""
     given = (settings.access.tls, settings.link.tls, None if settings.fleet is None else settings.fleet.tls)
     files = {one.certificate: None for one in given if one is not None and one.certificate is not None}
-    return [*filter(None, map(_lapse, files))]
+    return [*filter(None, map(_expiry_warning, files))]
 
 
-def _lapse(certificate: Path) -> str:
+def _expiry_warning(certificate: Path) -> str:
     try:
         # No public function reads a certificate that is not an authority's. Without this one, say nothing.
         decoded = ssl._ssl._test_decode_cert(str(certificate))  # type: ignore[attr-defined]

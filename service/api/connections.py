@@ -37,7 +37,7 @@ _LOOK_S = 0.2
 _MINUTE_S = 60.0
 _MOMENTS_S = 5.0
 """A client that acknowledges nothing of its answer for longer is ended when there is no more room."""
-_NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _BUSY = Problem(
     title="Service Unavailable",
     status=503,
@@ -51,7 +51,7 @@ _REFUSAL = (
 _BYTES_ACKED = 120
 """Offset of ``tcpi_bytes_acked`` in ``struct tcp_info`` (linux/tcp.h), since Linux 4.1."""
 
-_AT_ONCE = struct.pack("ii", 1, 0)
+_RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 _log = logger(part="http")
 
 _Doing = Literal["handshake", "head", "body", "answering"]
@@ -114,7 +114,7 @@ class _Connection:
         """End the connection at once and drop unsent data, which the system might otherwise keep indefinitely."""
         self.ended = True
         with suppress(OSError):
-            self.accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+            self.accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
         if self.protocol is not None:
             self.protocol.transport.abort()
             return
@@ -246,7 +246,7 @@ class HttpConnections:
 
     def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        if not isinstance(error, OSError) or error.errno not in _NO_FILES:
+        if not isinstance(error, OSError) or error.errno not in _OUT_OF_RESOURCES:
             loop.default_exception_handler(context)
             return
         self.exhausted += 1
@@ -274,7 +274,7 @@ class _Listener(socket.socket):
         try:
             accepted, address = super().accept()
         except OSError as error:
-            self._pause = error.errno in _NO_FILES
+            self._pause = error.errno in _OUT_OF_RESOURCES
             raise
         self._pause = not self._connections.admit(accepted, address)
         if accepted.fileno() < 0:

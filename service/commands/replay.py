@@ -338,22 +338,22 @@ def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], objec
         return
     if out.exists() and not overwrite:
         raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
-    with _named(out):
+    with _report_write_errors(out):
         file = out.open("w", encoding="utf-8", newline="\n")
 
     def write(line: str) -> None:
-        with _named(out, half=True):
+        with _report_write_errors(out, half=True):
             file.write(line + "\n")
 
     try:
         yield write
     finally:
-        with _named(out, half=True):
+        with _report_write_errors(out, half=True):
             file.close()
 
 
 @contextmanager
-def _named(out: Path, *, half: bool = False) -> Iterator[None]:
+def _report_write_errors(out: Path, *, half: bool = False) -> Iterator[None]:
     """Report a system error as one of writing `out`; if it came halfway (`half`), remove the incomplete file."""
     try:
         yield

@@ -106,11 +106,11 @@ class _Said:
 
     @cached_property
     def whole(self) -> str:
-        return _told(self.health, in_full=True)
+        return _health_event_text(self.health, in_full=True)
 
     @cached_property
     def overview(self) -> str:
-        return _told(self.health, in_full=False)
+        return _health_event_text(self.health, in_full=False)
 
 
 class EventFeed:
@@ -181,15 +181,15 @@ class EventFeed:
                 listener.reset()
                 behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
                 for place in behind:
-                    async for event in self._committed(place, logs[place], cursor):
+                    async for event in self._alarm_events(place, logs[place], cursor):
                         yield event
                 waits = any(cursor[place] < logs[place].last_sequence() for place in behind)
-                changed = self._said_after(number)
+                changed = self._health_after(number)
                 for place, said in changed:
                     number = said.number
                     if place in logs:
                         in_full = whole is None or place in whole
-                        async for event in self._changed(place, said, health, told, in_full=in_full):
+                        async for event in self._health_events(place, said, health, told, in_full=in_full):
                             yield event
                 if closes:
                     return
@@ -209,13 +209,13 @@ class EventFeed:
                 self._listeners.discard(listener)
                 self._lock.notify_all()
 
-    def _said_after(self, number: int) -> list[tuple[str, _Said]]:
+    def _health_after(self, number: int) -> list[tuple[str, _Said]]:
         """Health published after this number, in that order."""
         with self._lock:
             newer = itertools.takewhile(lambda one: one[1].number > number, reversed(self._health.items()))
             return list(newer)[::-1]
 
-    async def _changed(
+    async def _health_events(
         self, place: str, said: _Said, health: Callable[[str], Health], told: dict[str, int], *, in_full: bool
     ) -> AsyncIterator[str]:
         """Latest published health of a machine, unless it was sent already; the first time, as it is now."""
@@ -224,11 +224,11 @@ class EventFeed:
             return
         told[place] = latest.number
         if first:
-            yield await run_in_threadpool(lambda: _told(health(place), in_full=in_full))
+            yield await run_in_threadpool(lambda: _health_event_text(health(place), in_full=in_full))
         else:
             yield latest.whole if in_full else latest.overview
 
-    async def _committed(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
+    async def _alarm_events(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
         """Events in the log after the cursor, which moves along; none while the history cannot be read."""
         while cursor[place] < log.last_sequence():
             try:
@@ -242,7 +242,7 @@ class EventFeed:
                 return
 
 
-def _told(health: Health, *, in_full: bool) -> str:
+def _health_event_text(health: Health, *, in_full: bool) -> str:
     """Health as an event."""
     if in_full:
         return f"event: health\ndata: {health.model_dump_json()}\n\n"

@@ -8,14 +8,14 @@ import structlog
 _FORWARD_NS = 3600 * 10**9  # largest step believed at once, such as summer time or a correction at the start
 _BELIEVED_S = 86_400.0
 
-_SUSPENDED_TOO: int | None = getattr(time, "CLOCK_BOOTTIME", None)
+_BOOT_CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 _log = structlog.get_logger("rotorwatch", part="history")
 
 
 def running_s() -> float:
     """Monotonic time in seconds, on Linux counted also while the computer is suspended."""
-    return time.monotonic() if _SUSPENDED_TOO is None else time.clock_gettime(_SUSPENDED_TOO)
+    return time.monotonic() if _BOOT_CLOCK is None else time.clock_gettime(_BOOT_CLOCK)
 
 
 class AgeClock:

@@ -93,7 +93,7 @@ class Writer:
         claim = Claim(site, name, self._most_reports)
         with self._database.plainly(), self._connected() as connection:
             if any(other.title == claim.title for other in self._claims):
-                raise _taken(claim)
+                raise _claimed_elsewhere(claim)
             self._take(connection, claim)
             self._claims.append(claim)
         return claim
@@ -231,7 +231,7 @@ class Writer:
                 # A process that shares the machines may be ending, on its own, after its monitor was killed.
                 while (descriptor := lock_file(path)) is None:
                     if not self._shared or time.monotonic() > patience + _ENDS_S:
-                        raise _taken(claim)
+                        raise _claimed_elsewhere(claim)
                     time.sleep(_AGAIN_S)
                 undo.callback(os.close, descriptor)
             with connection.begin():
@@ -241,7 +241,7 @@ class Writer:
                 if not self._database.is_sqlite:
                     while not _lock_row(connection, found):
                         if time.monotonic() > patience:
-                            raise _taken(claim)
+                            raise _claimed_elsewhere(claim)
                         time.sleep(_AGAIN_S)
                 chosen = machines.c.machine_id == found
                 connection.execute(update(machines).where(chosen).values(owner=owner))
@@ -326,7 +326,7 @@ class Writer:
         _log.info("the history is being written again")
 
 
-def _taken(claim: Claim) -> StoreError:
+def _claimed_elsewhere(claim: Claim) -> StoreError:
     return StoreError(f"another monitor writes the history of {claim.title}")
 
 

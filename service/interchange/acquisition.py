@@ -28,7 +28,7 @@ from service.monitor.alarm_conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
 _TIME_RESPONSE = 1
-_EVEN = 1e-6
+_MOST_RATE_DIFFERENCE = 1e-6
 
 
 class TdmsSource(Source):
@@ -210,7 +210,7 @@ class UniversalSource(Source):
         """Rate from the abscissa's increment, or from its values where the file gives no increment."""
         rates = [self._rate_hz(reference) for reference in columns]
         for reference, rate_hz in zip(columns, rates, strict=True):
-            if abs(rate_hz / rates[0] - 1) > _EVEN:
+            if abs(rate_hz / rates[0] - 1) > _MOST_RATE_DIFFERENCE:
                 raise SourceError(
                     f"{self.path}: {reference} has {rate_hz:g} samples per second, {columns[0]} has {rates[0]:g}; "
                     "expected the same"
@@ -236,6 +236,6 @@ class UniversalSource(Source):
         if found["abscissa_spacing"] == 1 and step_s > 0:
             return 1 / step_s
         steps = np.diff(np.asarray(found["x"], dtype=np.float64))
-        if steps.size == 0 or steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean() + 1e-9:
+        if steps.size == 0 or steps.min() <= 0 or np.ptp(steps) > _MOST_RATE_DIFFERENCE * steps.mean() + 1e-9:
             raise SourceError(f"{self.path}: {reference} is not sampled evenly, expected one time step throughout")
         return float(1 / steps.mean())

@@ -144,12 +144,12 @@ def _places(paths: Sequence[Path]) -> list[int]:
     differing = [place for place, column in enumerate(columns) if len(set(column)) > 1]
     places = list(range(len(paths)))
     if len(differing) == 1 and differing[0] % 2 and len({len(row) for row in parts}) == 1:
-        found = filter(None, map(_steps, _readings(columns[differing[0]])))
+        found = filter(None, map(_steps, _number_meanings(columns[differing[0]])))
         places = min(found, key=lambda steps: steps[-1], default=places)
     return places
 
 
-def _readings(texts: Sequence[str]) -> Iterator[list[int]]:
+def _number_meanings(texts: Sequence[str]) -> Iterator[list[int]]:
     """Interpretations of the numbers in names: plain numbers, and times of day or dates in seconds."""
     yield [int(text) for text in texts]
     for form, length in (("%H%M", 4), ("%H%M%S", 6), ("%Y%m%d", 8)):

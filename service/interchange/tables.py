@@ -67,7 +67,7 @@ class CsvSource(_Table):
         except SourceError as error:
             if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
-            told = self._told(error)
+            told = self._error_text(error)
             if told.endswith(_NO_ROW):
                 raise SourceError(told) from error
             raise SourceError(
@@ -114,7 +114,7 @@ class CsvSource(_Table):
                         yield tuple(self._array(name, batch.column(self._labels[name])) for name in wanted)
             except pa.ArrowInvalid as error:
                 raise SourceError(
-                    self._fault(wanted) or f"{self.path}: after row {count}: {self._told(error)}"
+                    self._fault(wanted) or f"{self.path}: after row {count}: {self._error_text(error)}"
                 ) from error
 
     def _reader(self, path: Path, wanted: Sequence[str], *, as_text: bool = False) -> Any:
@@ -146,7 +146,7 @@ class CsvSource(_Table):
     def _array(self, name: str, column: Any) -> Array:
         return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
-    def _told(self, error: Exception) -> str:
+    def _error_text(self, error: Exception) -> str:
         """Arrow's message, rows counted from 1 without header lines; for one after many good rows, with a remedy."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
         text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
@@ -185,7 +185,7 @@ class CsvSource(_Table):
                                 )
                     row += batch.num_rows
             except pa.ArrowInvalid as error:
-                return f"{self.path}: after row {row}: {self._told(error)}"
+                return f"{self.path}: after row {row}: {self._error_text(error)}"
         return ""
 
     def _is_datetime(self, name: str) -> bool:

@@ -99,10 +99,10 @@ class MachineRecorder:
         self._catalogue = Catalogue(self.directory)
         self._pending: deque[RecordedMessage] = deque()  # taken out of the backlog, not written yet
         self._unsafe: deque[RecordedMessage] = deque()  # written, in a chunk that is not complete
-        self._at_hand = False  # whether the first pending message is being written
+        self._writing_first = False  # whether the first pending message is being written
         self._descriptor: RecordedMessage | None = None
         self._marks: tuple[AlarmMark, ...] = ()
-        self._unread = ""
+        self._unread_reason = ""
         self._writer: RecordingWriter | None = None
         self._lock: int | None = None
         self._opened_s = self._synced_s = self._tidied_s = clock()
@@ -180,7 +180,7 @@ class MachineRecorder:
                 # out.
                 if self._limiter.admit("defect") is not None:
                     self._log.exception("error in the recorder")
-                self._leave_out()
+                self._give_up_message()
                 self._fail(f"{type(error).__name__}: {error}")
             if self._give_up.wait(_RETRY_S):
                 if last:
@@ -198,9 +198,9 @@ class MachineRecorder:
             if not self._pending:
                 self._pending.extend(self._backlog.take(_SYNC_S / 4))
             if self._pending:
-                self._at_hand = True
+                self._writing_first = True
                 self._write(self._pending[0])
-                self._at_hand = False
+                self._writing_first = False
                 self._pending.popleft()
             writer, now_s = self._writer, self._clock()
             if writer is not None:
@@ -307,9 +307,9 @@ class MachineRecorder:
                 with suppress(OSError):
                     writer.part.unlink(missing_ok=True)
         again = list(self._unsafe)
-        if self._at_hand and again and again[-1] is self._pending[0]:
+        if self._writing_first and again and again[-1] is self._pending[0]:
             again.pop()
-        self._at_hand = False
+        self._writing_first = False
         self._pending.extendleft(reversed(again))
         self._unsafe.clear()
         if self._lock is not None:  # the folder may not be the same any more
@@ -318,14 +318,14 @@ class MachineRecorder:
         if (withheld := self._limiter.admit("failing")) is not None:
             self._log.error("recording fails, trying again", why=problem, waiting=len(again), withheld=withheld)
 
-    def _leave_out(self) -> None:
+    def _give_up_message(self) -> None:
         """Give up the message at hand."""
-        if self._at_hand:
+        if self._writing_first:
             message = self._pending.popleft()
             if self._unsafe and self._unsafe[-1] is message:
                 self._unsafe.pop()
             self._lost += 1
-            self._at_hand = False
+            self._writing_first = False
 
     def _tidy(self) -> None:
         """Complete files that a crash left, and drop files beyond the limits; errors here do not stop recording."""
@@ -359,11 +359,11 @@ class MachineRecorder:
         try:
             events = self._committed(oldest_ns - round(self.settings.alarm_after_s * 1e9))
             self._marks = tuple(map(alarm_mark, events))
-            self._unread = ""
+            self._unread_reason = ""
         except RotorwatchError as error:  # the marks known so far still count
-            if str(error) != self._unread:
+            if str(error) != self._unread_reason:
                 self._log.warning("the history cannot be read: alarms keep no more recordings", why=str(error))
-            self._unread = str(error)
+            self._unread_reason = str(error)
         decision = decide(recordings, self._marks, self.settings, self._age_ns())
         kept = {one.path.name: one.kept_because for one in recordings if one.kept_because}
         if decision.kept != kept:

@@ -125,12 +125,12 @@ class _Shard:
         wait_s = _AGAIN_S
         while not self._stopping.is_set():
             if not (how := self.process.ended(_LOOK_S)):
-                self._look()
+                self._report_hang()
                 continue
             self._is_up = False
             why = f"the process that monitored it {how} and is being started again"
             self._log.error("a shard is started again", machines=len(self.machines), why=how)
-            self._say(why)
+            self._set_down(why)
             while not self._stopping.is_set():
                 try:
                     self.process.begin_again()
@@ -141,29 +141,29 @@ class _Shard:
                 except Exception as error:  # whatever it is, the machines must not stay unmonitored
                     trace = None if isinstance(error, RotorwatchError) else error  # those explain themselves
                     self._log.error("a shard could not be started again", exc_info=trace, why=str(error))
-                    self._say(f"{why}, which failed: {error}")
+                    self._set_down(f"{why}, which failed: {error}")
                     self._stopping.wait(wait_s)
                     wait_s = min(2 * wait_s, _LONGEST_AGAIN_S)
                 else:
                     wait_s = _AGAIN_S
-                    self._say("")
+                    self._set_down("")
                     self._log.info("a shard continues")
                     break
 
-    def _look(self) -> None:
+    def _report_hang(self) -> None:
         """Report a process that hangs, and when it responds again."""
         hangs = any(one.not_monitored for one in self.machines)
         if hangs != self._hangs:
             self._hangs = hangs
             self._log.error("a shard does not respond" if hangs else "a shard responds again")
-            self._tell()
+            self._publish_health()
 
-    def _say(self, down: str) -> None:
+    def _set_down(self, down: str) -> None:
         for one in self.machines:
             one.down = down
-        self._tell()
+        self._publish_health()
 
-    def _tell(self) -> None:
+    def _publish_health(self) -> None:
         for one in self.machines:
             self._listener.health(one.health())
 
@@ -191,7 +191,7 @@ class Shards:
     def connect(self, undo: ExitStack) -> None:
         """Listen for streams as the settings say, for shards, and for their messages; raises `LinkError`."""
         self._link = self._placement.connect(undo)
-        undo.callback(hear(self._link, self._heard))
+        undo.callback(hear(self._link, self._take_standing))
 
     def open(self, undo: ExitStack) -> Sequence[RemoteMachine]:
         """Start the processes, and wait until every machine is monitored.
@@ -232,7 +232,7 @@ class Shards:
             shard.ask_to_stop()
         self._lost = "; ".join(filter(None, [shard.stop() for shard in self._shards]))
 
-    def _heard(self, content: bytes) -> None:
+    def _take_standing(self, content: bytes) -> None:
         standing = Standing.model_validate_json(content)
         machine = self._remote.get(standing.place)
         if machine is None:  # its shard is not ready yet, and will be asked for the complete state

@@ -50,7 +50,7 @@ class Question(BaseModel, frozen=True):
 def latest_to_bytes(data: LatestData) -> bytes:
     """Latest data of a monitor as bytes that hold nothing but numbers and text."""
     arrays: list[np.ndarray] = []
-    form = json.dumps(_form(data, arrays))
+    form = json.dumps(_to_plain(data, arrays))
     return to_bytes({"form": np.array([form])} | {str(number): array for number, array in enumerate(arrays)})
 
 
@@ -63,11 +63,11 @@ def latest_from_bytes(content: bytes) -> LatestData:
         If the bytes are damaged.
     """
     arrays = from_bytes(content)
-    found: LatestData = _value(json.loads(str(arrays["form"][0])), arrays)
+    found: LatestData = _from_plain(json.loads(str(arrays["form"][0])), arrays)
     return found
 
 
-def _form(value: object, arrays: list[np.ndarray]) -> Any:
+def _to_plain(value: object, arrays: list[np.ndarray]) -> Any:
     """The value for JSON, with its arrays moved to `arrays`; what is not plain becomes a pair of kind and content."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
@@ -75,23 +75,23 @@ def _form(value: object, arrays: list[np.ndarray]) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, tuple):
-        return ["tuple", [_form(one, arrays) for one in value]]
+        return ["tuple", [_to_plain(one, arrays) for one in value]]
     if isinstance(value, BaseModel):
         return [type(value).__name__, value.model_dump_json()]
     if dataclasses.is_dataclass(value):
-        fields = {one.name: _form(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
+        fields = {one.name: _to_plain(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
         return [type(value).__name__, fields]
     return value
 
 
-def _value(form: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _from_plain(form: Any, arrays: dict[str, np.ndarray]) -> Any:
     if not isinstance(form, list):
         return form
     kind, content = form
     if kind == "array":
         return arrays[content]
     if kind == "tuple":
-        return tuple(_value(one, arrays) for one in content)
+        return tuple(_from_plain(one, arrays) for one in content)
     if kind in _RECORDS:
         return _RECORDS[kind].model_validate_json(content)
-    return _PARTS[kind](**{name: _value(one, arrays) for name, one in content.items()})
+    return _PARTS[kind](**{name: _from_plain(one, arrays) for name, one in content.items()})

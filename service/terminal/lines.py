@@ -104,7 +104,7 @@ def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
     place = f"{states.site}/{states.machine}"
     return tuple(
         f"{_clock(alarm.raised_ns or alarm.since_ns)}  {place}  {alarm.severity.upper()} ({alarm.state}): "
-        f"{alarm.text}{with_minus_signs(_known(alarm))}"
+        f"{alarm.text}{with_minus_signs(_alarm_detail(alarm))}"
         for alarm in states.alarms
         if alarm.raised
     )
@@ -125,7 +125,7 @@ def health_line(health: Health) -> str:
     return f"{at}  {health.site}/{health.machine}  state is {health.state}{why}"
 
 
-def _known(alarm: Alarm) -> str:
+def _alarm_detail(alarm: Alarm) -> str:
     """Change of the parameter that the alarm is about, or the note of any other alarm."""
     if alarm.relative_change is not None:
         return f"  {_change(alarm.name, alarm.relative_change, alarm.standard_error)}"

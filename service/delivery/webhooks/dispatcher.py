@@ -153,7 +153,7 @@ class Dispatcher:
                     return 0.0
         except StoreError as error:
             self._due_s = now_s + _AGAIN_S
-            self._unwell(error)
+            self._note_store_error(error)
         return self._pause_s(now_s)
 
     def _run(self) -> None:
@@ -248,9 +248,9 @@ class Dispatcher:
             lane.saved = sequence
         except StoreError as error:
             self._save_due_s = self._clock() + _AGAIN_S
-            self._unwell(error)
+            self._note_store_error(error)
 
-    def _unwell(self, error: StoreError) -> None:
+    def _note_store_error(self, error: StoreError) -> None:
         self._note(str(error))
         self._limiter.say("history", self._log.warning, "the history cannot be used", why=str(error))
 

@@ -10,7 +10,7 @@ from service.recordings.replay.data_time import place_of
 from service.recordings.replay.source import RecordingSource
 
 _LONGEST_PAUSE_NS = 3600 * 10**9
-_BELIEVED = 10
+_MOST_LATE_BLOCKS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +94,15 @@ class _Timetable:
     def __init__(self, pace: float, start_ns: int, start_s: float) -> None:
         self._pace = pace
         self._front_ns, self._due_s = start_ns, start_s
-        self._behind = 0
+        self._late_blocks = 0
 
     def due_s(self, time_ns: int) -> float:
         """When a message with this time of the data is due, as `Control.now_s` counts."""
         ahead_ns = time_ns - self._front_ns
-        # A few blocks that come again, or late, do not set the time back; more than `_BELIEVED` in a row do.
-        self._behind = self._behind + 1 if ahead_ns < 0 else 0
+        # A few blocks that come again, or late, do not set the time back; more than `_MOST_LATE_BLOCKS` in a row do.
+        self._late_blocks = self._late_blocks + 1 if ahead_ns < 0 else 0
         if 0 < ahead_ns <= _LONGEST_PAUSE_NS:
             self._due_s += ahead_ns / 1e9 / self._pace
-        if ahead_ns > 0 or self._behind > _BELIEVED:
+        if ahead_ns > 0 or self._late_blocks > _MOST_LATE_BLOCKS:
             self._front_ns = time_ns
         return self._due_s

@@ -250,10 +250,10 @@ def _read(files: Sequence[_File], keys: frozenset[str] | None) -> Iterator[Recor
         yield from read_recording(inside[0].path, keys=keys)
     else:
         streams = [read_recording(file.path, keys=keys) for file in inside]
-        yield from _once(heapq.merge(*streams, key=lambda message: message.log_time_ns))
+        yield from _without_repeats(heapq.merge(*streams, key=lambda message: message.log_time_ns))
 
 
-def _once(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
+def _without_repeats(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
     """Leave out repetitions; they have the same time of recording and come one after the other."""
     now_ns: int | None = None
     seen: set[RecordedMessage] = set()
