@@ -53,6 +53,7 @@ _LINE_ERROR = 0.01  # least relative error of e if the angle is that of a line f
 # Standard deviation of the hops' speeds, relative, above which the theory is averaged over two speeds. With one source
 # and sensor noise of 0.3 %, the mean speed alone fits at 0.16 % and misfits by 7 standard errors at 0.32 %.
 _WANDERS = 0.002
+_MISFITS = 6  # windows in a row that misfit before the next one is searched cold: they may all share a wrong maximum
 _FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
 
@@ -74,7 +75,7 @@ class LikelihoodFit:
         self._last: FloatArray | None = None
         self._strength: float | None = None
         self._line: Linearised | None = None
-        self._line_segments = self._followed = 0
+        self._line_segments = self._followed = self._misfits = 0
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._latest: tuple[SpectralModel, Expected, FloatArray, float] | None = None
         self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
@@ -83,17 +84,20 @@ class LikelihoodFit:
     def reset(self) -> None:
         """Start the next window cold."""
         self._last = self._strength = self._line = None
+        self._misfits = 0
 
     def start_near(self, other: "LikelihoodFit") -> None:
-        """Start the next window where another fit of the same machine has ended."""
-        self._last, self._strength, self._line = other._last, other._strength, None
+        """Start the next window where another fit of the same machine has ended, cold if that misfits."""
+        self.reset()
+        if not other._misfits:
+            self._last, self._strength = other._last, other._strength
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""
         found: dict[str, np.ndarray] = {
             "last": np.array([] if self._last is None else self._last, dtype=np.float64),
             "strength": np.array([] if self._strength is None else [self._strength], dtype=np.float64),
-            "followed": np.array([self._line_segments, self._followed], dtype=np.int64),
+            "followed": np.array([self._line_segments, self._followed, self._misfits], dtype=np.int64),
         }
         line = self._line
         if line is not None and self._line_band is not None:
@@ -119,7 +123,7 @@ class LikelihoodFit:
             If the arrays are not of a fit of this machine; nothing is changed then.
         """
         last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
-        segments, followed = checked(arrays, "followed", np.int64, (2,)).tolist()
+        segments, followed, misfits = checked(arrays, "followed", np.int64, (3,)).tolist()
         line = band = None
         if "states" in arrays:
             frequencies_hz = checked(arrays, "frequencies_hz", np.float64, (None,))
@@ -131,7 +135,8 @@ class LikelihoodFit:
                 raise CheckpointError(f"{self._machine.name}: the remembered maximum makes no valid spectra") from error
         self._last = last if last.size else None
         self._strength = float(strength[0]) if strength.size else None
-        self._line, self._line_band, self._line_segments, self._followed = line, band, segments, followed
+        self._line, self._line_band, self._line_segments = line, band, segments
+        self._followed, self._misfits = followed, misfits
 
     def _restored_line(
         self,
@@ -166,6 +171,8 @@ class LikelihoodFit:
         UnexplainedError
             If the search finds no maximum, or nothing within the model comes near the window.
         """
+        if self._misfits == _MISFITS:
+            self.reset()
         window = integrated(window)
         speed, speeds = self._speed(window), self._speeds(window)
         excluded = _near_lines(window, speed)
@@ -190,6 +197,7 @@ class LikelihoodFit:
         if nowhere:
             raise UnexplainedError(unexplained)
         goodness = goodness_of_fit(self._machine, model, weights, found, states)
+        self._misfits = self._misfits + 1 if goodness.misfit_z > MOST_MISFIT else 0
         if not unexplained and goodness.misfit_z > MOST_MISFIT:
             unexplained = self._stated(unseen(model, weights, found, goodness.misfit_z))
         n = len(STRUCTURAL)
