@@ -60,6 +60,36 @@ def foreign_rotation(observed: FloatArray, explained: FloatArray, spread: FloatA
     return f"its misfit χ² is {text} with {2 * n - 2} degrees of freedom, evaluation limit {limit}"
 
 
+_MOST_SCATTER = 0.35  # median change of a vector from hop to hop, relative, up to which reversed signs are seen
+_HALF_TURN = (0.15, 3.0, 0.5)  # distance from the reversed vector: a part of it plus standard errors, and at most
+
+
+def reversed_signs(window: WindowStatistics) -> str:
+    """Sentence on 1x vectors that turned by 180° within the window at constant length, while no other one changed.
+
+    They say nothing of the unbalance then: a heavy spot turns all vectors, mostly by another angle, and a change of the
+    rotor changes their lengths, too. Empty if nothing of the kind is seen.
+    """
+    vectors = window.hop_synchronous
+    if vectors is None or len(vectors) < 3 or window.removed_by_hop or not vectors.any(axis=1).all():
+        return ""
+    unit = vectors / np.abs(vectors).mean(axis=0)
+    scatter = np.median(np.abs(np.diff(unit, axis=0)), axis=0)
+    if np.any(scatter > _MOST_SCATTER):
+        return ""
+    # Between the two sides may be a hop astride the reversal.
+    sides = [(unit[:hop], unit[hop + 1 :]) for hop in range(1, len(unit) - 1)]
+    before, after = min(sides, key=lambda both: sum(side.var(axis=0).sum() * len(side) for side in both))
+    ratio = after.mean(axis=0) / before.mean(axis=0)
+    part, errors, most = _HALF_TURN
+    near = np.minimum(part + errors * scatter * np.sqrt(1 / len(before) + 1 / len(after)), most)
+    turned = np.abs(ratio + 1) < near
+    if np.count_nonzero(turned) < 2 or not np.all(turned | (np.abs(ratio - 1) < near)):
+        return ""
+    names = ", ".join(state for state, one in zip(window.states, turned, strict=True) if one)
+    return f"the 1× vectors of {names} turned by 180° within the window and kept their length: reversed signs?"
+
+
 _DIRECTION_ERRORS = 3.0  # standard errors from which a vector has a direction
 # Least movement of the heavy spot that counts as turned, in standard errors and as part of the unbalance: angle sensors
 # and probes are not mounted more accurately than to a few degrees.

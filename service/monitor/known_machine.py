@@ -14,7 +14,7 @@ from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading, reversed_signs
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
@@ -74,6 +74,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._angle_unchecked = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window on which the other sense was tried
         self._rotation = LatestRotation()
+        self._reversed = ""  # why the latest window and its newest hops say nothing of the unbalance
         self._compare_with(machine)
 
     def _compare_with(self, machine: Machine) -> None:
@@ -103,6 +104,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         window, latest = settled(self._machine.title, window, newest)
         speed = self._speed(window)
         self._rotation.take(window)
+        self._reversed = reversed_signs(window)
         window = window if self.directed else replace(window, directed=False)
         deciding = self._diagnose_window(window)
         if self._sense_open:
@@ -296,6 +298,9 @@ class KnownMachineEvaluator(WindowEvaluator):
             suspect = left.suspected(unexplained=bool(stated.unexplained))
             stated = replace(stated, misfit_z=left.misfit_z, suspect=suspect)
         vector = stated.unbalance
+        if vector is not None and self._reversed:
+            vector = replace(vector, foreign=self._reversed)
+            stated = replace(stated, unbalance=vector)
         seen = any(state.endswith("_dot") for state in window.states)  # displacements alone may have run-out
         usable = not (self._commissioned or stated.unexplained)
         if vector is not None and vector.foreign and seen and usable and stated.misfit_z is not None:

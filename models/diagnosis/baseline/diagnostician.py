@@ -28,7 +28,7 @@ from models.diagnosis.baseline.unbalance import (
     relative_force,
     rotation_of,
 )
-from models.diagnosis.readings import Diagnosis, beyond, foreign_rotation, no_reading, parameter_reading
+from models.diagnosis.readings import Diagnosis, beyond, foreign_rotation, no_reading, parameter_reading, reversed_signs
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
@@ -283,6 +283,8 @@ class BaselineDiagnostician:
         ]
         if not rows:
             raise EstimationError("no relation could be read")
+        if reversed_within := reversed_signs(window):
+            raise EstimationError(reversed_within)
         coordinates = tuple(sorted({motion.coordinate for one in rows for motion in one.row.motions}))
         healthy, now = self._rotations(coordinates, window)
         cov = self._baseline.covariance

@@ -110,6 +110,20 @@ def test_a_1x_vector_that_no_unbalance_causes_is_unexplained(plane: str) -> None
         assert not more.unexplained
 
 
+@pytest.mark.parametrize("planes", ["y", "yz"])
+def test_signs_reversed_within_the_window_give_no_reading_of_the_unbalance(planes: str) -> None:
+    """One hop of reversed signs was taken for a changed unbalance, with full confidence."""
+    quiet = replace(OTHER, level_N=1.0)
+    reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
+    (window,) = recorded(ROTOR, quiet, 3)
+    of_plane = [state[0] in planes for state in window.states]
+    for hops, factor, unread in ((1, -1.0, True), (4, -1.0, True), (4, 1.0j, False), (4, -2.0, False)):
+        vectors = sure(window.hop_synchronous).copy()
+        vectors[-hops:, of_plane] *= factor
+        found = reading.diagnose(replace(window, hop_synchronous=vectors))
+        assert ("turned by 180° within the window" in found.parameters[-1].reason) == unread, (hops, factor)
+
+
 def test_an_unbalance_smaller_than_its_errors_is_not_determined() -> None:
     """As two sines in all channels left of a rotor: a hop of that was a defect in the monitor."""
     lost = positive(np.array([[-8.0, 0.0], [-12.0, -2.0]]) * 2.0**40)  # what cancels in such a hop
