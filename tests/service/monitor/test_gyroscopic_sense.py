@@ -62,7 +62,7 @@ def test_a_change_from_the_beginning_is_named_in_the_opposite_sense() -> None:
     assert windows[-1].misfit_z < 4.0
 
 
-@pytest.mark.parametrize("machine", [LAB, PARTIAL, blind(LAB)])
+@pytest.mark.parametrize("machine", [LAB, pytest.param(PARTIAL, marks=pytest.mark.long), blind(LAB)])
 def test_commissioning_finds_the_sense(machine: MachineFile) -> None:
     """With a shaft angle, or without one, where the size of the unbalance is identified."""
     seen = stream(75.0, SEED + 2)

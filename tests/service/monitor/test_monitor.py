@@ -188,15 +188,14 @@ def test_the_state_is_not_evaluable_while_no_hop_is_complete(torn: str) -> None:
     assert (target.health().state, target.health().reason) == (HealthState.HEALTHY, "")
 
 
-@pytest.mark.parametrize("restarted", [False, True])
-def test_a_jump_of_the_phase_reference_is_never_an_unbalance(restarted: bool) -> None:
+def test_a_jump_of_the_phase_reference_is_never_an_unbalance() -> None:
     """Nor after a restart."""
     target, turned = watching(), rotor_kit.samples_of(healthy(180.0)[650:])
     turned[:, -1] = np.mod(turned[:, -1] + np.pi / 2, 2 * np.pi)
     after = with_samples(healthy(180.0)[650:], turned)
     windows, events = feed(target, after[:650])
     assert windows[-1].state is HealthState.HEALTHY
-    target = resumed(target, KIT) if restarted else target
+    target = resumed(target, KIT)
     windows, more = feed(target, after[650:])
     assert named([*events, *more]) == [("raised", "data-phase-reference")]
     e = next(one for one in windows[-1].parameters if one.name == "e")
@@ -206,7 +205,7 @@ def test_a_jump_of_the_phase_reference_is_never_an_unbalance(restarted: bool) ->
 
 
 def test_a_step_of_the_load_is_inside_the_model() -> None:
-    windows, events = feed(monitor(), stream(125.0, Event(at_s=65.0, excitation_level=3.0)))
+    windows, events = feed(monitor(), stream(95.0, Event(at_s=65.0, excitation_level=3.0)))
     assert events == []
     assert {one.verdict.outside_model for one in windows if one.verdict is not None} == {False}
 
@@ -225,15 +224,15 @@ def test_a_run_down_raises_no_alarm() -> None:
     """With one source, where any residual of the rotation would be a misfit; also when it hardly turns."""
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
     scenario = draw_condition(draw, 1)
-    stop = Event(at_s=65.0, ramp_s=60.0, speed_rpm=0.1)
-    scenario = scenario.model_copy(update={"duration_s": 150.0, "events": (*scenario.events, stop)})
+    stop = Event(at_s=63.0, ramp_s=45.0, speed_rpm=0.1)
+    scenario = scenario.model_copy(update={"duration_s": 125.0, "events": (*scenario.events, stop)})
     windows, events = feed(monitor(), [block for block, _ in blocks(scenario, LAB)])
     assert events == []
     assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
 def test_a_speed_out_of_range_is_not_evaluable_and_no_alarm() -> None:
-    windows, events = feed(MachineMonitor(Installed(LAB)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
+    windows, events = feed(MachineMonitor(Installed(LAB)), stream(63.0, Event(at_s=0.0, speed_rpm=2000.0)))
     assert windows[-1].state is HealthState.NOT_EVALUABLE
     assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluation limit 20 %" in windows[-1].reason
     assert windows[-1].parameters == ()
@@ -283,16 +282,6 @@ def test_faulty_channels_raise_data_alarms_and_no_machine_alarm(kind: str) -> No
     assert all(window.reason or "diagnosed without it" in window.sensors[0].text for window in seen[11:])
 
 
-def test_parameters_that_the_sensors_do_not_measure_are_not_read() -> None:
-    horizontal = [column for column, sensor in enumerate(LAB.sensors) if sensor.direction != "z"]
-    part = LAB.model_copy(update={"sensors": tuple(LAB.sensors[column] for column in horizontal)})
-    blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in healthy(63.0)]
-    readings = {one.name: one for one in feed(MachineMonitor(Installed(part)), blocks_)[0][-1].parameters}
-    assert readings["k_bz"].relative_change is None
-    assert readings["k_bz"].reason == "no displacement or velocity measured in z"
-    assert abs(readings["k_by"].relative_change or 1.0) < 0.1
-
-
 def test_one_wild_sample_does_not_blind_the_monitor() -> None:
     everything = healthy(73.0)
     wild = everything[0].samples.copy()
@@ -316,11 +305,6 @@ def test_occasional_clipping_names_the_measuring_range_as_suspect() -> None:
         evaluation = Evaluation(Diagnosis("", misfit_z=misfit_z, suspect="a mass"), {}, (), (), None)
         found = evaluation.named(target.machine.sensors, sure(target.window)(), "").deciding.suspect
         assert told in found
-
-
-def test_without_a_bundle_equations_state_the_missing_network() -> None:
-    window = feed(MachineMonitor(Installed(LAB)), healthy(63.0))[0][-1]
-    assert {equation.reason for equation in window.equations} == {"no trained network"}
 
 
 def test_a_1x_that_no_unbalance_can_cause_is_outside_the_model() -> None:
@@ -367,5 +351,10 @@ def test_a_healthy_verdict_names_the_parameters_not_read() -> None:
     assert not events
     verdict = sure(windows[-1].verdict)
     assert (windows[-1].state, verdict.text) == (HealthState.HEALTHY, "nothing has changed; not read: k_bz, c_bz")
+    readings = {one.name: one for one in windows[-1].parameters}
+    assert readings["k_bz"].relative_change is None
+    assert readings["k_bz"].reason == "no displacement or velocity measured in z"
+    assert abs(readings["k_by"].relative_change or 1.0) < 0.1
     (*_, whole), _ = feed(MachineMonitor(install(kit, None)), healthy(65.0))
     assert sure(whole.verdict).text == "nothing has changed"
+    assert {equation.reason for equation in whole.equations} == {"no trained network"}

@@ -18,7 +18,7 @@ from tests.service.rig.live import LAB, scenario_blocks
 from tests.service.rig.watching import feed, raised, resumed
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})})
-DEAD_S, CHANGE_S, END_S = 40.0, 70.0, 130.0
+DEAD_S, CHANGE_S, END_S = 40.0, 70.0, 110.0
 
 
 def dying(

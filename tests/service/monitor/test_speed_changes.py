@@ -42,7 +42,6 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
     [
         (LAB, 79.0, Event(at_s=65.0, speed_rpm=0.65 * RPM, ramp_s=14.0), ""),  # switched off
         (LAB, 75.0, Event(at_s=66.0, speed_rpm=1.04 * RPM), STEP),
-        (LAB, 75.0, Event(at_s=66.0, speed_rpm=0.95 * RPM), STEP),
         (WITHOUT_ANGLE, 130.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=40.0), "the speed left 1056 to 1584 rpm"),
         (WITHOUT_ANGLE, 95.0, Event(at_s=65.0, speed_rpm=0.3 * RPM, ramp_s=14.0), "5 of 12 hops, evaluation limit 50%"),
     ],
@@ -55,7 +54,7 @@ def test_a_rotation_that_cannot_be_removed_is_not_evaluable_and_no_misfit(
     assert told in windows[-1].reason
 
 
-@pytest.mark.parametrize("to", [0.97, 1.12])
+@pytest.mark.parametrize("to", [pytest.param(0.97, marks=pytest.mark.long), 1.12])
 def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(to: float) -> None:
     """While a window holds both, on the hops before or after the change."""
     change = Event(at_s=66.0, speed_rpm=to * RPM, ramp_s=3.0)
@@ -81,15 +80,14 @@ def commissioned_at_both_speeds() -> Installed:
     return Installed(machine, None, sure(commissioned(machine, *healthy).commissioned))
 
 
-@pytest.mark.parametrize("parameter", ["", "k_by"])
-def test_at_level_none_a_drive_is_judged_at_each_set_point(parameter: str) -> None:
+def test_at_level_none_a_drive_is_judged_at_each_set_point() -> None:
     """A bearing that changes while the window holds both is still named."""
     changes = [Event(at_s=67.0, speed_rpm=1.15 * RPM, ramp_s=6.0), Event(at_s=170.0, speed_rpm=RPM)]
-    changes += [Event(at_s=100.0, parameter=parameter, relative_change=-0.25)] if parameter else []
+    changes += [Event(at_s=100.0, parameter="k_by", relative_change=-0.25)]
     monitor = MachineMonitor(commissioned_at_both_speeds())
     windows, events = feed(monitor, drive(5_290_020, *changes, duration_s=225.0))
     raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
-    assert raised == ({parameter} if parameter else set())
+    assert raised == {"k_by"}
     assert {window.state for window in windows if window.filled == 1.0} >= {HealthState.HEALTHY}
     assert all(window.speed_rad_s is not None for window in windows if window.filled == 1.0)
 
