@@ -444,13 +444,6 @@ def test_a_rule_on_stream_lost_suppresses_while_it_is_raised() -> None:
     assert named(monitor.passed(START_NS + 9 * S)) == [("raised", STREAM_LOST), ("suppressed", GAP)]
 
 
-def test_an_alarm_escalates_only_if_the_change_is_named() -> None:
-    book = AlarmBook(AlarmSettings(on_delay_s=0))
-    assert book.update("k_by", -0.2, 0.01, 0, named=True)
-    assert not book.update("k_by", -0.9, 0.5, S, named=False)
-    assert [event.kind for event in book.update("k_by", -0.9, 0.5, 2 * S, named=True)] == ["escalated"]
-
-
 def test_gaps_and_silences_have_the_time_without_data_as_evidence() -> None:
     monitor = MachineMonitor(install(machine(), None))
     monitor.step(block(0))

@@ -1,7 +1,7 @@
 """Alarm scenarios in compact notation: one character per window of five seconds.
 
-``.`` nothing, ``x`` beyond the limit, ``X`` beyond danger, ``o`` between the limits, ``?`` as large as ``x`` but not
-found to have changed, ``_`` not evaluated.
+``.`` nothing, ``x`` beyond the limit, ``X`` beyond danger, ``o`` between the limits, ``?`` as large as ``x`` and ``!``
+as large as ``X`` but not found to have changed, ``_`` not evaluated.
 Events: ``^`` raised, ``!`` escalated, ``v`` cleared.
 """
 
@@ -21,7 +21,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 
-CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
+CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6, "!": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
 SETTINGS = AlarmSettings(on_delay_s=10, off_delay_s=15)
 
@@ -49,6 +49,7 @@ def play(story: str, settings: AlarmSettings = SETTINGS) -> tuple[str, AlarmBook
         ("..xxxoooooo", "    ^      "),  # between the limits: neither clears nor raises
         ("oooooooo", "        "),
         ("..xxxXX....", "    ^!    v"),
+        ("..xxx!X....", "    ^ !   v"),  # only a named change escalates
         ("XXX.....", "  ^   v "),  # straight to danger: one event
         ("..xxx____....", "    ^       v"),  # missing data do not clear an alarm
         ("..x____xx", "       ^ "),  # and does not stop a pending delay, which is data time

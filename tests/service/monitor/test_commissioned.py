@@ -164,7 +164,7 @@ def test_level_growth_that_a_named_change_does_not_explain_raises_its_alarm() ->
     assert "y2 (disc y) 2x" in next(event.alarm.note for event in events if event.alarm.name == f"{LEVEL}y2")
 
 
-@pytest.mark.parametrize("place", ["1", "2"])
+@pytest.mark.parametrize("place", [pytest.param("1", marks=pytest.mark.long), "2"])
 def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named(place: str) -> None:
     names = [channel.name for channel in LAB.sensors]
     wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]

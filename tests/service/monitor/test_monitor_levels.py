@@ -98,23 +98,13 @@ def test_a_running_speed_in_the_machine_file_is_tracked_in_the_vibration() -> No
     assert [one.x1 for one in latest(monitor).levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
-def test_doubling_after_the_first_windows_raises_the_channels_level_alarm(seed: int) -> None:
-    monitor = MachineMonitor(install(FAN, None))
-    _, events = run(monitor, blocks(seed, 140, growth=(90.0, 2.0)))
-    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
-    assert 90 < events[0][2] <= 90 + 2 * FAN.window.length_s
-    alarm = next(one for one in monitor.health().alarms if one.name == "level:DE-H")
-    assert "alert limit" in alarm.note
-    assert "the first windows" in alarm.note
-    assert monitor.health().state is HealthState.ALERT
-
-
 def test_growth_to_four_times_is_a_danger_and_clears_when_it_ends() -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, blocks(4, 120, growth=(80.0, 4.0)))
     kinds = [kind for kind, name, _ in events if name == "level:DE-H"]
     assert kinds in ([EventKind.RAISED], [EventKind.RAISED, EventKind.ESCALATED])
+    assert {name for _, name, _ in events} == {"level:DE-H"}
+    assert 80 < events[0][2] <= 80 + 2 * FAN.window.length_s
     assert monitor.health().state is HealthState.DANGER
     _, events = run(monitor, blocks(4, 120, first=240))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.CLEARED, "level:DE-H")]
@@ -279,6 +269,10 @@ def test_a_watched_machine_states_the_detectable_level_growth() -> None:
     _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
     assert latest(monitor).level_growth is None  # the alert replaces it
+    assert monitor.health().state is HealthState.ALERT
+    alarm = next(one for one in monitor.health().alarms if one.name == "level:DE-H")
+    assert "alert limit" in alarm.note
+    assert "the first windows" in alarm.note
 
 
 def test_status_shows_the_detectable_growth_and_fits_narrow_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,20 +324,6 @@ def test_a_faulty_probe_does_not_raise_s_max_of_the_other_probe() -> None:
     _, later = run(monitor, iter(jumping[720:]))
     assert {name for _, name, _ in events + later} == {"data-offset", "level:DE-Y"}
     assert sure(latest(monitor).levels[0].s_max) < 100
-
-
-def test_a_dead_casing_sensor_does_not_change_the_diagnosis_of_the_rotor() -> None:
-    casing = Sensor(name="DE-H", quantity="acceleration", location="DE", direction="horizontal", unit="m/s2")
-    rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
-    monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
-    for block in scenario_blocks(72.0):
-        wider = np.pad(block.samples.astype(np.float32), ((0, 0), (0, 1)))
-        monitor.step(replace(block, samples=wider))
-        alone.step(block)
-    told, plain = latest(monitor), latest(alone)
-    assert [one.states for one in told.sensors] == [("@DE-H",)]
-    assert (told.state, told.verdict) == (plain.state, plain.verdict)
-    assert [one.name for one in monitor.health().alarms if one.raised] == ["data-stuck"]
 
 
 MESH = 17.0

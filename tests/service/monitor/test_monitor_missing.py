@@ -60,7 +60,7 @@ def usual(end_s: float, *, moved: bool = False) -> Sequence[Report]:
     return feed(MachineMonitor(Installed(elsewhere(KIT) if moved else SOON)), scenario_blocks(end_s))[0]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window(value: float) -> None:
     monitor, sound = MachineMonitor(install(SOON, None)), usual(85.0)
     stream = list(without(Z1_DOT, FROM_S, TO_S, value, end_s=85.0))
@@ -88,18 +88,16 @@ def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window(value: 
     assert [one.name for one in last.parameters] == [one.name for one in other.parameters]
 
 
-@pytest.mark.parametrize("column", [0, 1])
-def test_s_max_is_not_stated_if_one_of_its_two_probes_is_missing(column: int) -> None:
+def test_s_max_is_not_stated_if_one_of_its_two_probes_is_missing() -> None:
     monitor = MachineMonitor(install(KIT, None))
-    reports, _ = feed(monitor, without(column, 31.0, 45.0, end_s=50.0))
+    reports, _ = feed(monitor, without(0, 31.0, 45.0, end_s=50.0))
     told = {level.channel: level for level in reports[-1].levels}
-    lacking, other = ("y1", "z1") if column == 0 else ("z1", "y1")
-    assert (told[lacking].overall, told[lacking].s_max, told[other].s_max) == (None, None, None)
-    assert told[other].overall is not None
+    assert (told["y1"].overall, told["y1"].s_max, told["z1"].s_max) == (None, None, None)
+    assert told["z1"].overall is not None
     assert told["y2"].s_max is not None
 
 
-@pytest.mark.parametrize(("measure", "column"), [("overall", 0), ("x1", 0), ("s_max", 1)])
+@pytest.mark.parametrize(("measure", "column"), [("overall", 0), ("s_max", 1)])
 def test_a_level_alarm_stays_while_samples_of_its_level_are_missing(measure: str, column: int) -> None:
     own = LAB.levels.model_copy(update={"limits": (LevelLimit(channel="y1", measure=measure, alert=0.1),)})
     soon = AlarmSettings(on_delay_s=1.0, off_delay_s=1.0)
@@ -108,21 +106,23 @@ def test_a_level_alarm_stays_while_samples_of_its_level_are_missing(measure: str
     assert named(events) == [("raised", "level:y1"), ("raised", "data-missing")]
 
 
-def test_an_unconnected_casing_sensor_does_not_change_the_diagnosis() -> None:
+@pytest.mark.parametrize(("value", "kind"), [(np.nan, "missing"), (0.0, "stuck")])
+def test_a_dead_casing_sensor_does_not_change_the_diagnosis(value: float, kind: str) -> None:
     monitor, alone = MachineMonitor(install(RIG, None)), MachineMonitor(install(KIT, None))
     stream = scenario_blocks(40.0)
-    gap = np.full((len(stream[0].samples), 1), np.nan, np.float32)
+    gap = np.full((len(stream[0].samples), 1), value, np.float32)
     wider = [replace(one, samples=np.hstack([one.samples.astype(np.float32), gap])) for one in stream]
     told, plain = feed(monitor, wider)[0][-1], feed(alone, stream)[0][-1]
-    assert [(fault.states, fault.kind) for fault in told.sensors] == [(("@DE-H",), "missing")]
+    assert [(fault.states, fault.kind) for fault in told.sensors] == [(("@DE-H",), kind)]
     assert (told.state, told.verdict, told.parameters) == (plain.state, plain.verdict, plain.parameters)
+    assert raised(monitor) == {f"data-{kind}"}
 
 
 @pytest.mark.parametrize(
     ("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")]
 )
 def test_a_sensor_never_connected_is_reported_before_the_first_full_window(column: int, state: str, alarm: str) -> None:
-    monitor, stream = MachineMonitor(install(KIT, None)), list(without(column, 0.0, END_S))
+    monitor, stream = MachineMonitor(install(KIT, None)), list(without(column, 0.0, END_S, end_s=50.0))
     reports = feed(monitor, stream[:190])[0]
     assert [[fault.states for fault in one.sensors] for one in reports] == [[(state,)]] * len(reports)
     assert {one.state for one in reports} == {HealthState.WARMING}
@@ -132,7 +132,7 @@ def test_a_sensor_never_connected_is_reported_before_the_first_full_window(colum
     assert raised(monitor) == {alarm}
 
 
-@pytest.mark.parametrize("lost", [np.nan, 1.0])
+@pytest.mark.parametrize("lost", [pytest.param(np.nan, marks=pytest.mark.long), 1.0])
 def test_a_lost_phase_reference_raises_only_its_own_alarm(lost: float) -> None:
     """The hop in which it was lost turned half as far; no vibration is at a multiple of that speed."""
     made = commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:800])).commissioned
@@ -149,7 +149,7 @@ def test_a_lost_phase_reference_raises_only_its_own_alarm(lost: float) -> None:
     assert None not in {one.overall for one in levels[True]} | {one.x1 for one in levels[False]}
 
 
-@pytest.mark.parametrize("lost", [np.nan, 1.0])
+@pytest.mark.parametrize("lost", [pytest.param(np.nan, marks=pytest.mark.long), 1.0])
 def test_first_windows_with_a_lost_angle_are_not_a_reference(lost: float) -> None:
     """The speed seems to differ in them."""
     first = LAB.levels.model_copy(update={"reference": "first windows", "reference_windows": 2})
@@ -177,7 +177,7 @@ def test_without_an_angle_levels_are_not_compared_with_another_speed() -> None:
     assert told == {PHASE_REFERENCE}
 
 
-@pytest.mark.parametrize("lost", [np.nan, 1.0])
+@pytest.mark.parametrize("lost", [np.nan, pytest.param(1.0, marks=pytest.mark.long)])
 def test_run_out_is_not_a_sensor_fault_while_the_angle_is_lost(lost: float) -> None:
     stream = []
     for block in without(THETA, 0.0, 0.0, end_s=38.0):
@@ -188,7 +188,7 @@ def test_run_out_is_not_a_sensor_fault_while_the_angle_is_lost(lost: float) -> N
     assert blamed(stream) == {"theta"}
 
 
-@pytest.mark.parametrize("lost", [np.nan, 1.0])
+@pytest.mark.parametrize("lost", [pytest.param(np.nan, marks=pytest.mark.long), 1.0])
 def test_a_lost_phase_reference_is_not_taken_for_a_slow_machine(lost: float) -> None:
     rule = {"alarms": ["model"], "below_rpm": 600, "because": "coasting down"}
     alarms = AlarmSettings.model_validate({"suppress": [rule]})
@@ -222,7 +222,7 @@ def test_blocks_with_single_nan_samples_or_only_nan_are_refused(
 
 
 def test_a_restored_monitor_with_a_recalled_window_continues_bit_for_bit() -> None:
-    stream = list(without(Z1_DOT, FROM_S, TO_S))
+    stream = list(without(Z1_DOT, FROM_S, TO_S, end_s=75.0))
     monitor = MachineMonitor(install(KIT, None))
     half = 340  # a second after the last missing sample
     feed(monitor, stream[:half])[0]
