@@ -34,8 +34,7 @@ def turning(hz: float, sense: int = 1) -> Callable[[FloatArray], FloatArray]:
     return lambda t: (sense * 2 * np.pi * hz * t) % (2 * np.pi)
 
 
-@pytest.mark.parametrize("sense", [1, -1])
-@pytest.mark.parametrize("orders", [False, True])
+@pytest.mark.parametrize(("sense", "orders"), [(1, False), (-1, True)])
 def test_a_circle_is_one_line_and_an_ellipse_two_in_full_spectra(tmp_path: Path, sense: int, orders: bool) -> None:
     """A circle of radius 20 µm; an ellipse with half axes of 30 and 10 µm, the sum and difference of two circles."""
     angle = 2 * np.pi * 20.0

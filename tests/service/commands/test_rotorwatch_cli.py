@@ -82,10 +82,9 @@ def test_an_inaccessible_file_is_reported_in_one_line(capsys: pytest.CaptureFixt
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
 
-@pytest.mark.parametrize("command", [("size", "--machines", "3"), ("check-config", "models/machines/lab.toml")])
-def test_a_full_disk_is_reported_in_one_line(command: tuple[str, ...]) -> None:
+def test_a_full_disk_is_reported_in_one_line() -> None:
     with Path("/dev/full").open("w", encoding="utf-8") as full:
-        argv = [sys.executable, "-m", "service", *command]
+        argv = [sys.executable, "-m", "service", "size", "--machines", "3"]
         found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
     assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 

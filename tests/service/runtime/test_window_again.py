@@ -190,7 +190,7 @@ def test_after_a_kill_an_unrecoverable_window_refills_and_alarms_stay_raised(tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kept", [0, 20])
+@pytest.mark.parametrize("kept", [pytest.param(0, marks=pytest.mark.long), 20])
 def test_after_a_clean_stop_the_window_is_kept(tmp_path: Path, kept: int) -> None:
     with restarted(tmp_path, recording=False, kept=kept, killed=False) as (here, second):
         health = second.health()

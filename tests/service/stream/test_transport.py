@@ -12,8 +12,7 @@ import zenoh.ext
 from structlog.testing import capture_logs
 
 from models.signals.link import LinkSettings
-from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
-from rotorwatch.records.health import Health
+from rotorwatch.records.alarms import AlarmLogPage
 from service.history.records import StoreError
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.intake import Intake
@@ -23,7 +22,6 @@ from tests.service.rig.live import (
     Feed,
     advanced_publisher,
     endpoint,
-    fed_service,
     ignore,
     machine_link,
     no_events,
@@ -172,19 +170,6 @@ def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Call
         return condition()
 
     return act_and_look
-
-
-def test_late_joiners_can_query_health_and_alarm_states() -> None:
-    with fed_service() as (runtime, worker, feed):
-        feed.put_good(5)
-        until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
-        with open_session(runtime.settings.link.listen[0]) as session:
-            health = Health.model_validate_json(query(session, KEYS.health))
-            assert (health.quality.accepted_blocks, health.machine_hash) == (5, worker.identity["machine_hash"])
-            states = AlarmStates.model_validate_json(query(session, KEYS.alarm_state))
-            assert (states.site, states.machine, states.alarms) == ("demo", "lab", ())
-            alive = [reply.ok.key_expr for reply in session.liveliness().get("rotorwatch/**") if reply.ok is not None]
-            assert [str(key) for key in alive] == [KEYS.monitor_alive]
 
 
 def query(session: zenoh.Session, key: str) -> str:
