@@ -143,6 +143,7 @@ def test_a_tiles_trend_breaks_at_gaps_and_is_flat_below_detectable_changes(
         assert least <= rise <= most  # of 22, the full height for detectable changes
 
 
+@pytest.mark.long
 def test_the_page_benchmark_measures_a_plant(
     browser: Browser, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

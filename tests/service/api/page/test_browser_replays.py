@@ -159,25 +159,24 @@ def test_a_recording_is_replayed_with_other_settings_and_browsed_by_window(brows
         assert not [one for one in asked if "/replays" in one and not one.endswith(".js")]
         page.evaluate("window.looks = true; document.dispatchEvent(new Event('visibilitychange'))")
         expect(page.locator("replay-view").get_by_role("status").first).to_contain_text("Finished")
-    for kind, phone, dark in (("dark", False, True), ("phone", True, False)):
-        with looking(browser, url, phone=phone, dark=dark) as page:
-            for name, address in (("replay", replayed), ("recordings", f"{url}/#/recordings")):
-                page.goto(address)
-                there = "replay-levels canvas" if name == "replay" else "recording-table tbody tr"
-                expect(page.locator(there).first).to_be_visible()
-                if name == "replay":
-                    expect(page.locator("parameter-table tr.alert, alarm-comparison tbody tr")).to_have_count(2)
-                    scrub = page.get_by_role("slider", name="Window")
-                    scrub.focus()
-                    page.mouse.wheel(0, 3000)
-                    until(partial(page.evaluate, "scrollY > 1500"), "the page to scroll")
-                    tall = page.locator(".replay-banner").evaluate("one => one.getBoundingClientRect().bottom")
-                    # The slider stays visible below the banner, however many lines that has.
-                    assert scrub.evaluate("one => one.getBoundingClientRect().top") >= tall > 0
-                    page.evaluate("scrollTo(0, 0)")
-                kept(page, f"{name}-{kind}")
-                assert not violations(page)
-                assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+    with looking(browser, url, phone=True, dark=True) as page:
+        for name, address in (("replay", replayed), ("recordings", f"{url}/#/recordings")):
+            page.goto(address)
+            there = "replay-levels canvas" if name == "replay" else "recording-table tbody tr"
+            expect(page.locator(there).first).to_be_visible()
+            if name == "replay":
+                expect(page.locator("parameter-table tr.alert, alarm-comparison tbody tr")).to_have_count(2)
+                scrub = page.get_by_role("slider", name="Window")
+                scrub.focus()
+                page.mouse.wheel(0, 3000)
+                until(partial(page.evaluate, "scrollY > 1500"), "the page to scroll")
+                tall = page.locator(".replay-banner").evaluate("one => one.getBoundingClientRect().bottom")
+                # The slider stays visible below the banner, however many lines that has.
+                assert scrub.evaluate("one => one.getBoundingClientRect().top") >= tall > 0
+                page.evaluate("scrollTo(0, 0)")
+            kept(page, f"{name}-dark-phone")
+            assert not violations(page)
+            assert page.evaluate("document.documentElement.scrollWidth") == 390
 
 
 # Drag the slider over all windows up to one.
@@ -264,22 +263,20 @@ def test_orbits_and_spectra_are_those_of_the_selected_window(browser: Browser, r
             expect(page.locator("window-plots correlation-plot")).to_contain_text("Replay, window 2026-01-01 00:00:")
             assert not violations(page)
             kept(page, "replay-window-all")
-        for kind, phone, dark in (("dark", False, True), ("phone", True, False)):
-            with looking(browser, url, phone=phone, dark=dark) as page:
-                if kind == "dark":  # an empty response; a refusal would be an error on the console too
-                    page.clock.install()
-                    page.route("**/spectra?*", lambda route: route.fulfill(json={}))
-                page.goto(f"{url}/#/replays/{job_id}")
-                expect(page.locator("window-plots summary")).to_have_count(len(FOLDS))
-                unfolded(page, *FOLDS)
-                if kind == "dark":
-                    expect(page.locator("window-plots spectrum-plot")).to_contain_text("undefined")
-                    page.unroute("**/spectra?*")
-                    page.clock.fast_forward(16_000)
-                expect(page.locator("window-plots canvas")).to_have_count(8)
-                kept(page, f"replay-window-{kind}")
-                assert not violations(page)
-                assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+        with looking(browser, url, phone=True, dark=True) as page:
+            page.clock.install()
+            # An empty response; a refusal would be an error on the console too.
+            page.route("**/spectra?*", lambda route: route.fulfill(json={}))
+            page.goto(f"{url}/#/replays/{job_id}")
+            expect(page.locator("window-plots summary")).to_have_count(len(FOLDS))
+            unfolded(page, *FOLDS)
+            expect(page.locator("window-plots spectrum-plot")).to_contain_text("undefined")
+            page.unroute("**/spectra?*")
+            page.clock.fast_forward(16_000)
+            expect(page.locator("window-plots canvas")).to_have_count(8)
+            kept(page, "replay-window-dark-phone")
+            assert not violations(page)
+            assert page.evaluate("document.documentElement.scrollWidth") == 390
 
 
 def test_a_paced_replay_is_paused_moved_and_stopped(browser: Browser, runtime: Runtime) -> None:
