@@ -16,7 +16,7 @@ from rotorwatch.records.health import MEASURES, Health
 from rotorwatch.records.history import ReadingList, ReportList
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration
 from rotorwatch.records.monitor import CallerRights
-from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.access.scopes import Scope
 from service.api.description import DescribedApp
 from service.api.routes.page import page_files
@@ -137,9 +137,19 @@ def test_readings_are_reduced_to_the_requested_number_of_points(http: httpx.Clie
         ("alarms/events?name=level:y9", "demo/lab: no alarm level:y9; there are: k_by"),
         ("../../../trends?of=demo/lab/level/y9:overall", "demo/lab: of is 'y9:overall', but it has no such level"),
         ("../../../trends?of=k_by", "of: expected site/machine/quantity/name, where the quantity is one of parame"),
+        ("reports?limit=1001", "limit: expected at most 1000 (found '1001')"),
+        ("reports?limit=1e3", "limit: expected a whole number (found '1e3')"),
+        ("reports?before=9223372036854775808", "before: expected at most "),
+        ("alarms?state=angry", "state: expected one of normal, "),
+        ("readings?quantity=speeds&name=x", "quantity: expected one of parameter, equation, level, "),
+        ("detectable?change=-1", "change: expected above -1 (found '-1')"),
+        ("detectable?change=nan", "change: expected a finite number (found 'nan')"),
     ],
 )
-def test_arguments_that_do_not_fit_together_are_explained(http: httpx.Client, query: str, text: str) -> None:
+def test_arguments_that_are_invalid_or_do_not_fit_together_are_explained(
+    http: httpx.Client, query: str, text: str
+) -> None:
+    """For all routes and arguments `test_openapi` generates more."""
     assert problem(http.get(f"{PLACE}/{query}"), 422).detail.startswith(text)
 
 
@@ -185,19 +195,6 @@ def test_detectable_changes_of_each_parameter(http: httpx.Client) -> None:
     assert asked.change == -0.1
     for parameter in asked.parameters:
         assert (sure(parameter.length_s) < 60.0) == (parameter.loss > -0.1)
-
-
-def test_correlations_fit_theory_only_with_the_estimated_parameters(http: httpx.Client) -> None:
-    found = answered(http.get(f"{PLACE}/correlations?first=y2&second=y2"), CorrelationSnapshot)
-    (pair,) = found.pairs
-    assert len(pair.measured) == len(sure(pair.estimated)) == len(found.lags_s) > 10
-    # A third of a bearing's stiffness is missing: only theory with the estimated parameters fits.
-    assert sure(pair.estimated_z) < 3 < sure(pair.nominal_z)
-    health = answered(http.get(f"{PLACE}/health"), Health)
-    assert health.report is not None
-    assert (found.start_ns, found.end_ns) == (health.report.start_ns, health.report.end_ns)
-    changes = {one.name: one.relative_change for one in found.theory.changes}
-    assert changes["k_by"] == pytest.approx(health.report.parameters[0].relative_change, rel=1e-5)
 
 
 def test_spectra_and_orbits_are_those_asked_for(http: httpx.Client) -> None:
@@ -266,24 +263,6 @@ def test_an_unknown_path_gets_404_with_the_closest_match(http: httpx.Client, pat
         assert "did you mean" not in found.detail
     else:
         assert found.detail.endswith(f"did you mean {near}?")
-
-
-@pytest.mark.parametrize(
-    ("query", "told"),
-    [
-        ("reports?limit=1001", "limit: expected at most 1000 (found '1001')"),
-        ("reports?limit=1e3", "limit: expected a whole number (found '1e3')"),
-        ("reports?before=9223372036854775808", "before: expected at most "),
-        ("alarms?state=angry", "state: expected one of normal, "),
-        ("readings?quantity=speeds&name=x", "quantity: expected one of parameter, equation, level, "),
-        ("detectable?change=-1", "change: expected above -1 (found '-1')"),
-        ("detectable?change=nan", "change: expected a finite number (found 'nan')"),
-    ],
-)
-def test_an_invalid_argument_gets_422_with_its_name(http: httpx.Client, query: str, told: str) -> None:
-    """For all routes and arguments `test_openapi` generates more."""
-    found = problem(http.get(f"{PLACE}/{query}"), 422)
-    assert found.detail.startswith(told), found.detail
 
 
 def test_a_change_too_small_to_detect_is_refused(http: httpx.Client) -> None:

@@ -142,11 +142,7 @@ def test_plots_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, 
 
 @pytest.mark.parametrize(
     ("options", "count"),
-    [
-        (("--from", "12", "--to", "15"), 30),
-        (("--from", "2026-01-01T00:00:12Z", "--to", "2026-01-01T00:00:15Z"), 30),
-        (("--from", "39", "--to", "4000"), 10),
-    ],
+    [(("--from", "12", "--to", "2026-01-01T00:00:15Z"), 30), (("--from", "39", "--to", "4000"), 10)],
 )
 def test_a_replay_is_limited_by_data_times(quick: Path, tmp_path: Path, options: tuple[str, ...], count: int) -> None:
     out = tmp_path / "lines.jsonl"

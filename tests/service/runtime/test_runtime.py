@@ -20,12 +20,11 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from service.api.server import HttpError
-from service.api.views import found_machine
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from service.runtime.runtime import Runtime, running
-from service.settings.service import HttpSettings, MachineEntry
+from service.settings.service import HttpSettings
 from service.stream.checkpoints import stored_event, stored_report
 from service.stream.transport import LinkError, TopicMessage, follow
 from service.terminal.logs import Limiter
@@ -33,11 +32,9 @@ from simulator.scenario import parse_fault
 from tests.service.rig.live import (
     IMPATIENT,
     ROOT,
-    Feed,
     endpoint,
     fed_service,
     machine_file,
-    open_session,
     scenario_blocks,
     send,
     service,
@@ -160,25 +157,6 @@ def test_a_defect_in_the_monitor_costs_one_block_and_raises_an_alarm(monkeypatch
         until(lambda: "monitor-fault" in {one.name for one in worker.alarms().alarms if one.raised}, "the alarm on it")
         answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False, timeout=180.0)
         assert (answer.status_code, answer.json()["machines"][0]["worker_errors"]) == (200, 1)
-
-
-def test_bad_blocks_of_one_machine_do_not_affect_another(tmp_path: Path) -> None:
-    other = machine_file(tmp_path, ('name = "lab"', 'name = "rig-2"'))
-    address = endpoint()
-    two = settings(address, machines=(MachineEntry(file="lab"), MachineEntry(file=other)))
-    with running(two) as runtime, open_session(address) as session:
-        first, second = runtime.machines()
-        feed = Feed(session, second.machine)
-        feed.put_raw(b"", b"", "rubbish")
-        feed.put_good()
-        Feed(session).put_good()
-        until(lambda: first.health().quality.accepted_blocks == 1, "block of the first")
-        until(lambda: second.health().quality.accepted_blocks == 1, "block of the second")
-        assert first.health().quality.refused_blocks == {}
-        assert second.health().quality.refused_blocks == {"malformed": 1}
-        assert found_machine(runtime, "demo", "rig-2") is second
-        listed = httpx.get(f"{runtime.http_url}/api/v1/machines", trust_env=False, timeout=180.0).json()["machines"]
-        assert [entry["machine"] for entry in listed] == ["lab", "rig-2"]
 
 
 def test_a_failed_start_leaves_nothing_running_and_frees_its_ports() -> None:

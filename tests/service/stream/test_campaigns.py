@@ -25,7 +25,7 @@ def _programs_start_at_once_and_leave_nothing(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(importlib.import_module("running_monitor"), "started", started)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_monitor_survives_hostile_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -38,7 +38,7 @@ def test_a_monitor_survives_hostile_messages(
     assert sum(found["refused"].values()) > 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_monitor_survives_http_misuse(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["http_campaign", "--small"])
     code = importlib.import_module("http_campaign").main()
