@@ -217,6 +217,22 @@ def test_an_equally_likely_wrong_gain_is_named_beside_the_parameters(change: flo
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
+def lasting(said: Verdict) -> list[AlarmEvent]:
+    """Events of three hops with the same verdict."""
+    book = AlarmBook(SETTINGS)
+    for number in range(3):
+        book.found(said, "", "", number * 5_000_000_000)
+    return list(book.take())
+
+
+def test_a_stiffer_shaft_has_low_confidence_and_a_smaller_unbalance_is_no_danger() -> None:
+    (event,) = lasting(verdict({"EI": 0.99}, change=0.2))
+    assert event.alarm.low_confidence
+    assert "locked coupling" in event.text
+    for change, severity in ((0.9, Severity.DANGER), (-0.9, Severity.ALERT)):
+        assert [event.alarm.severity for event in lasting(verdict({"e": 0.99}, change=change))] == [severity]
+
+
 def test_stiffening_or_small_changes_explain_no_levels_and_a_repaired_shaft_clears() -> None:
     book = AlarmBook(SETTINGS)
     changes = ({"EI": 0.99}, 0.2), ({"EI": 0.99}, -0.2), ({"EI": 0.99, "e": 0.99}, 0.2)
@@ -254,11 +270,10 @@ def test_a_baseline_unbalance_beside_bearing_changes_has_low_confidence(
     others: tuple[str, ...], by: str, settled: bool, reserve: bool
 ) -> None:
     """The foundation may have changed, or a bearing in this window; then the unbalance is misread."""
-    book, found = AlarmBook(SETTINGS), verdict(dict.fromkeys((*others, "e"), 1.0), settled=settled)
+    found = verdict(dict.fromkeys((*others, "e"), 1.0), settled=settled)
     current = tuple(one.model_copy(update={"by": by}) for one in found.current)
-    for number in range(3):
-        book.found(found.model_copy(update={"current": current}), "", "", number * 5_000_000_000)
-    named = {event.alarm.name: event.alarm.low_confidence for event in book.take()}
+    told = lasting(found.model_copy(update={"current": current}))
+    named = {event.alarm.name: event.alarm.low_confidence for event in told}
     assert named == dict.fromkeys(others, False) | {"e": reserve}
 
 
@@ -270,12 +285,11 @@ def test_an_unbalance_has_low_confidence_while_both_stiffnesses_read_softer(
     vertical: float, by: str, *, reserve: bool
 ) -> None:
     """As of a softened foundation, where an unbalance happened to explain the window better."""
-    book, found = AlarmBook(SETTINGS), verdict({"e": 1.0, "k_by": 0.1, "k_bz": 0.1})
+    found = verdict({"e": 1.0, "k_by": 0.1, "k_bz": 0.1})
     changes = {"e": 0.17, "k_by": -0.3, "k_bz": vertical}
     current = tuple(one.model_copy(update={"by": by, "relative_change": changes[one.name]}) for one in found.current)
-    for number in range(3):
-        book.found(found.model_copy(update={"current": current}), "", "", number * 5_000_000_000)
-    assert {event.alarm.name: event.alarm.low_confidence for event in book.take()} == {"e": reserve}
+    told = lasting(found.model_copy(update={"current": current}))
+    assert {event.alarm.name: event.alarm.low_confidence for event in told} == {"e": reserve}
 
 
 def test_a_named_alarm_gets_low_confidence_while_nothing_explains_the_machine() -> None:

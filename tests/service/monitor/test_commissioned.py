@@ -1,7 +1,6 @@
 """The monitor of a machine commissioned without known parameters, from block to alarm."""
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -58,7 +57,8 @@ def test_the_healthy_machine_stays_healthy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "change"), [pytest.param("k_by", -0.2, marks=pytest.mark.long), ("c_bz", -0.4), ("e", 0.5)]
+    ("name", "change"),
+    [("c_bz", -0.4), *(pytest.param(*one, marks=pytest.mark.long) for one in (("k_by", -0.2), ("e", 0.5)))],
 )
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     blocks = stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
@@ -71,19 +71,16 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
     assert low - 0.05 < change < high + 0.05
 
 
-@pytest.mark.parametrize(("alarm", "sign", "source"), [("data-gain", -1, "y1"), ("data-swapped", 1, "z1")])
-def test_reversed_or_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter(
-    alarm: str, sign: int, source: str
-) -> None:
+def test_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter() -> None:
     """They agree with each other, and the machine is as it was."""
-    names, healthy = [sensor.name for sensor in MACHINE.sensors], stream(85.0, SEED + 3)
+    names, healthy = [sensor.name for sensor in MACHINE.sensors], stream(65.0, SEED + 3)
     samples = samples_of(healthy)
     wired = samples.copy()
     for rate in ("", "_dot"):
-        own, other = names.index(f"y1{rate}"), names.index(f"{source}{rate}")
-        wired[:, [own, other]] = sign * samples[:, [other, own]]
+        own, other = names.index(f"y1{rate}"), names.index(f"z1{rate}")
+        wired[:, [own, other]] = samples[:, [other, own]]
     windows, events = feed(MachineMonitor(installed()), with_samples(healthy, wired))
-    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {alarm}
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-swapped"}
     assert not any(window.parameters for window in full(windows))
 
 
@@ -122,7 +119,6 @@ def test_a_speed_not_commissioned_is_not_evaluable_and_raises_only_levels() -> N
     ("clearance_m", "size", "of"),
     [
         pytest.param(4e-5, 2.0, installed, id="heavy"),
-        pytest.param(8e-5, 0.5, installed, marks=pytest.mark.long, id="light"),
         pytest.param(
             8e-5,
             0.5,
@@ -164,17 +160,15 @@ def test_level_growth_that_a_named_change_does_not_explain_raises_its_alarm() ->
     assert "y2 (disc y) 2x" in next(event.alarm.note for event in events if event.alarm.name == f"{LEVEL}y2")
 
 
-@pytest.mark.parametrize("place", [pytest.param("1", marks=pytest.mark.long), "2"])
-def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named(place: str) -> None:
+def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named() -> None:
     names = [channel.name for channel in LAB.sensors]
-    wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]
-    healthy = stream(70.0, SEED + 8)
+    healthy = stream(63.0, SEED + 8)
     samples = samples_of(healthy)
-    samples[:, wrong] *= 0.8
+    samples[:, [names.index("y2"), names.index("y2_dot")]] *= 0.8
     windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
     raised = {event.alarm.name: event.alarm for event in events}
-    assert f"gain of y{place} and y{place}_dot: 0.8" in raised[MODEL].note
-    assert f"gain of y{place} and y{place}_dot: 0.8" in full(windows)[-1].suspect
+    assert "gain of y2 and y2_dot: 0.8" in raised[MODEL].note
+    assert "gain of y2 and y2_dot: 0.8" in full(windows)[-1].suspect
     assert not raised.keys() & set(PARAMETERS)
 
 
@@ -189,7 +183,7 @@ def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named(place: str)
     ],
 )
 def test_a_line_that_the_healthy_machine_lacked_is_suspected(hz: float, told: tuple[str, ...]) -> None:
-    healthy = stream(70.0, SEED + 9)
+    healthy = stream(63.0, SEED + 9)
     samples = samples_of(healthy)
     turned = 2 * np.pi * hz * np.arange(len(samples)) / LAB.rate_hz
     for column, one in enumerate(LAB.sensors):
@@ -206,7 +200,7 @@ def test_a_line_that_the_healthy_machine_lacked_is_suspected(hz: float, told: tu
 
 def test_nothing_is_named_where_a_line_dominates_the_vibration() -> None:
     """A 1x and a sine with random phases in every channel are no rotor's motion, whatever fits them."""
-    healthy, rng = stream(70.0, SEED + 9), np.random.default_rng(1)
+    healthy, rng = stream(63.0, SEED + 9), np.random.default_rng(1)
     samples = samples_of(healthy)
     names = [channel.name for channel in LAB.sensors]
     turned = np.unwrap(samples[:, names.index("theta")])
@@ -234,48 +228,20 @@ def test_a_2x_beyond_a_configured_limit_raises_its_level_alarm_only() -> None:
     assert not any(window.suspect for window in windows)
 
 
-def _faulty(kind: str) -> list[SampleBlock]:
-    """Data after a healthy full window, with a faulty sensor."""
-    blocks = stream(125.0, SEED + 4)[_FULL : 1250 if kind == "swapped" else 830 if kind == "gain drift" else 730]
-    samples = samples_of(blocks)
-    names = [channel.name for channel in LAB.sensors]
-    y1, y2, z1 = (names.index(name) for name in ("y1", "y2", "z1"))
-    match kind:
-        case "gain drift":
-            samples[:, y2] *= np.linspace(1.0, 0.7, samples.shape[0])
-        case "offset":
-            samples[:, y1] += 8 * samples[:, y1].std()
-        case "swapped":
-            samples[:, [y1, z1]] = samples[:, [z1, y1]]
-        case "delayed":
-            samples[6:, y1] = samples[:-6, y1]
-    return with_samples(blocks, samples)
-
-
-@cache
-def _watching() -> MachineMonitor:
-    target = MachineMonitor(installed())
-    feed(target, stream(125.0, SEED + 4)[:_FULL])
-    return target
-
-
-@pytest.mark.parametrize(
-    ("kind", "told"),
-    [
-        ("gain drift", "gain"),
-        ("offset", "offset"),
-        ("swapped", "swapped"),  # while the window holds both, it is only incoherent
-        ("delayed", "delay"),
-    ],
-)
-def test_a_faulty_sensor_raises_a_data_alarm_and_no_machine_alarm(kind: str, told: str) -> None:
-    windows, events = feed(deepcopy(_watching()), _faulty(kind))
+# The tests of sensor checks show how other faults are found.
+def test_a_drifting_gain_raises_a_data_alarm_and_no_machine_alarm() -> None:
+    monitor, healthy = MachineMonitor(installed()), stream(83.0, SEED + 4)
+    feed(monitor, healthy[:_FULL])
+    samples = samples_of(healthy[_FULL:])
+    y2 = [channel.name for channel in LAB.sensors].index("y2")
+    samples[:, y2] *= np.linspace(1.0, 0.7, samples.shape[0])
+    windows, events = feed(monitor, with_samples(healthy[_FULL:], samples))
     last = full(windows)[-1]
     assert last.state is HealthState.DATA_HEALTH
     assert last.sensors
     assert last.sensors[0].text in last.reason
     assert all(event.alarm.name.startswith("data-") for event in events)
-    assert events[-1].alarm.name == f"data-{told}"
+    assert events[-1].alarm.name == "data-gain"
 
 
 def of_sensors(columns: list[int], blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
@@ -303,6 +269,7 @@ def test_with_too_few_sensors_only_a_change_of_shape_and_levels_is_reported() ->
     assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
 
 
+@pytest.mark.long  # in short, a wrong gain is no change of a parameter
 def test_swapped_displacement_sensors_are_not_called_healthy() -> None:
     displacements = [n for n, channel in enumerate(MACHINE.sensors) if channel.quantity != "velocity"]
     made = with_sensors(displacements, 150.0)

@@ -1,7 +1,6 @@
 """A heavy spot at another angle than assumed, with and without its angle in the machine file."""
 
 import math
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -12,11 +11,9 @@ from models.commissioning.commissioned import Installed
 from models.machine import Machine, load_machine, load_machine_file
 from models.signals.block import SampleBlock
 from rotorwatch.records.windows import Parameter
-from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import without_angle
 from tests.service.rig.watching import feed, named, resumed
 
 LAB = load_machine("lab")
@@ -33,21 +30,6 @@ def stream(duration_s: float, phase_rad: float, *events: Event) -> tuple[SampleB
     scenario, _ = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=duration_s, seed=SEED, faults=events)
     return tuple(block for block, _ in blocks(scenario, with_heavy_spot(phase_rad)))
-
-
-@cache
-def watching(angle: bool) -> MachineMonitor:
-    """A monitor that has seen the first 80 s, the same for all changes; copy it before feeding."""
-    sensors = LAB.sensors if angle else tuple(one for one in LAB.sensors if one.name != "theta")
-    target = MachineMonitor(Installed(LAB.model_copy(update={"sensors": sensors})))
-    assert not feed(target, stream(80.0, 0.15) if angle else without_angle(stream(80.0, 0.15)))[1]
-    return target
-
-
-def changed(duration_s: float, parameter: str, change: float, *, angle: bool = True) -> list[AlarmEvent]:
-    """Alarm events for a change after 80 s."""
-    parts = stream(duration_s, 0.15, Event(at_s=80.0, parameter=parameter, relative_change=change))
-    return feed(deepcopy(watching(angle)), parts[800:] if angle else without_angle(parts[800:]))[1]
 
 
 def e_of(parameters: tuple[Parameter, ...]) -> float:
@@ -81,20 +63,6 @@ def test_without_an_unbalance_phase_in_the_file_any_heavy_spot_angle_is_healthy(
     assert [name for kind, name in named(events) if kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
     assert angle or all(one.vector is None for one in windows[-1].parameters)  # which needs an angle
-
-
-@pytest.mark.parametrize("angle", [True, pytest.param(False, marks=pytest.mark.long)])
-def test_a_smaller_unbalance_is_an_alert_and_no_danger(angle: bool) -> None:
-    events = changed(130.0, "e", -0.6, angle=angle)
-    assert [(event.kind, event.alarm.name, event.alarm.severity) for event in events] == [("raised", "e", "alert")]
-
-
-def test_a_stiffer_shaft_has_low_confidence() -> None:
-    """As with a locked coupling; a softer shaft, as with a crack, is named with full confidence."""
-    for change, reserve in ((0.2, True), (-0.2, False)):
-        (event,) = (one for one in changed(120.0, "EI", change) if one.alarm.name == "EI")
-        assert event.alarm.low_confidence is reserve
-        assert ("locked coupling" in event.text) is reserve
 
 
 def test_with_an_unbalance_phase_in_the_file_another_angle_is_a_change() -> None:

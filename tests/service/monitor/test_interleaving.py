@@ -24,6 +24,8 @@ from tests.service.rig.live import START_NS, until
 from tests.sure import sure
 
 SEED = 7_700_501
+# In short, test_arrivals has late and repeated blocks, test_window_again a monitor that is killed and goes on.
+pytestmark = pytest.mark.long
 REORDERED = 8
 """How far blocks are out of order, and how many of them the monitor waits for."""
 CACHED = 120
@@ -109,8 +111,7 @@ class Plant:
         self.at.store.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(4, 10))])
+@pytest.mark.parametrize("seed", range(3, 10))
 def test_repetitions_reordering_and_restarts_change_nothing(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
     strikes, repeated = int(rng.integers(1, 4)), rng.uniform(0.0, 0.5)

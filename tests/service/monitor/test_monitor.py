@@ -57,20 +57,19 @@ def watching() -> MachineMonitor:
 
 @pytest.mark.slow
 def test_reports_do_not_depend_on_the_block_length() -> None:
-    """Tenths of a second, uneven lengths, 1.9 s blocks, and encoded bytes: the same reports to the last bit."""
+    """Tenths of a second, uneven lengths, and encoded bytes: the same reports to the last bit."""
     fine = healthy(63.0)
     expected, _ = feed(monitor(), fine)
     assert [report.state for report in expected[:11]] == [HealthState.WARMING] * 11
     assert [report.state for report in expected[11:]] == [HealthState.HEALTHY]
     samples = np.concatenate([block.samples for block in fine])
-    for lengths in (np.full(40, 3800), np.random.default_rng(0).integers(10, 3000, 200)):
-        cuts = np.cumsum(lengths)
-        cuts = np.array([0, *cuts[cuts < samples.shape[0]], samples.shape[0]])
-        others = [
-            SampleBlock(fine[0].start_ns + int(begin) * 500_000, number, 1, 2000.0, samples[begin:end])
-            for number, (begin, end) in enumerate(pairwise(cuts))
-        ]
-        assert feed(monitor(), others)[0] == expected
+    cuts = np.cumsum(np.random.default_rng(0).integers(10, 3900, 200))
+    cuts = np.array([0, *cuts[cuts < samples.shape[0]], samples.shape[0]])
+    others = [
+        SampleBlock(fine[0].start_ns + int(begin) * 500_000, number, 1, 2000.0, samples[begin:end])
+        for number, (begin, end) in enumerate(pairwise(cuts))
+    ]
+    assert feed(monitor(), others)[0] == expected
     target = monitor()
     decoded = [target.step_payload(*encode_block(block, target.machine.descriptor.schema_hash)) for block in fine]
     assert [window for reports in decoded for report in reports for window in report.windows] == expected
@@ -204,6 +203,7 @@ def test_a_jump_of_the_phase_reference_is_never_an_unbalance() -> None:
     assert target.health().state is HealthState.HEALTHY
 
 
+@pytest.mark.long  # in short, a stepping load is read from the segments of a window
 def test_a_step_of_the_load_is_inside_the_model() -> None:
     windows, events = feed(monitor(), stream(95.0, Event(at_s=65.0, excitation_level=3.0)))
     assert events == []
@@ -211,7 +211,7 @@ def test_a_step_of_the_load_is_inside_the_model() -> None:
 
 
 def test_mains_hum_is_tolerated_and_another_line_is_named_with_its_frequency() -> None:
-    windows, events = feed(monitor(), with_lines(healthy(75.0), {50.02: 0.1, 150.06: 0.03}))
+    windows, events = feed(monitor(), with_lines(healthy(68.0), {50.02: 0.1, 150.06: 0.03}))
     assert {one.state for one in windows if one.filled == 1.0} == {HealthState.HEALTHY}
     assert events == []
     assert not [each for one in windows[-1].opinions for each in one.agreement if each.verdict == "disagree"]
@@ -231,50 +231,15 @@ def test_a_run_down_raises_no_alarm() -> None:
     assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
-def test_a_speed_out_of_range_is_not_evaluable_and_no_alarm() -> None:
-    windows, events = feed(MachineMonitor(Installed(LAB)), stream(63.0, Event(at_s=0.0, speed_rpm=2000.0)))
-    assert windows[-1].state is HealthState.NOT_EVALUABLE
-    assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluation limit 20 %" in windows[-1].reason
-    assert windows[-1].parameters == ()
-    assert not events
-
-
-@pytest.mark.slow
-def test_an_unsteady_speed_is_not_evaluable() -> None:
-    windows, events = feed(
-        MachineMonitor(Installed(LAB)), stream(98.0, Event(at_s=20.0, ramp_s=10.0, speed_rpm=1580.0))
-    )
-    states = [window.state for window in windows]
-    assert states[11] is HealthState.NOT_EVALUABLE
-    assert "speed went from 1320 to 1580 rpm within the window" in windows[11].reason
-    assert states[-1] is HealthState.HEALTHY  # at the new speed
-    assert not events
-
-
-# The tests of sensor checks show how each is found.
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *("stuck angle", "dead probe", "clipped"),
-        *(pytest.param(kind, marks=pytest.mark.long) for kind in ("backwards", "constant channel", "twins")),
-    ],
-)
+# The tests of sensor checks show how each fault is found.
+@pytest.mark.parametrize("kind", ["stuck angle", "clipped"])
 def test_faulty_channels_raise_data_alarms_and_no_machine_alarm(kind: str) -> None:
     healthy_ = healthy(73.0)  # three full windows: long enough for an alarm
     samples = rotor_kit.samples_of(healthy_)
-    match kind:
-        case "stuck angle":
-            samples[:, 8] = 1.0
-        case "backwards":
-            samples[:, 8] = 2 * np.pi - samples[:, 8]
-        case "constant channel":
-            samples[:, 3] = 0.5
-        case "twins":
-            samples[:, 4] = samples[:, 5]
-        case "dead probe":
-            samples[:, 5] = 0.01 * np.random.default_rng(1).standard_normal(len(samples))
-        case "clipped":
-            samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
+    if kind == "stuck angle":
+        samples[:, 8] = 1.0
+    else:
+        samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
     seen, events = feed(monitor(), with_samples(healthy_, samples))
     assert len(seen) == 14
     assert all(event.alarm.name.startswith("data-") for event in events)
@@ -283,7 +248,7 @@ def test_faulty_channels_raise_data_alarms_and_no_machine_alarm(kind: str) -> No
 
 
 def test_one_wild_sample_does_not_blind_the_monitor() -> None:
-    everything = healthy(73.0)
+    everything = healthy(68.0)
     wild = everything[0].samples.copy()
     wild[50, 0] = 1e30
     windows, events = feed(monitor(), [replace(everything[0], samples=wild), *everything[1:]])
@@ -308,7 +273,7 @@ def test_occasional_clipping_names_the_measuring_range_as_suspect() -> None:
 
 
 def test_a_1x_that_no_unbalance_can_cause_is_outside_the_model() -> None:
-    blocks_, names = healthy(75.0), [channel.name for channel in LAB.sensors]
+    blocks_, names = healthy(68.0), [channel.name for channel in LAB.sensors]
     samples = rotor_kit.samples_of(blocks_)
     turning = np.exp(1j * samples[:, names.index("theta")])
     for place, side in (("y1", 1.0), ("z1", -1j)):  # at the bearing alone, which no force on the disc does
@@ -321,30 +286,12 @@ def test_a_1x_that_no_unbalance_can_cause_is_outside_the_model() -> None:
     assert [event.alarm.name for event in events if event.alarm.name in {MODEL, *PARAMETERS}] == [MODEL]
 
 
-def test_sequential_sampling_of_channels_is_suspected_if_nothing_is_read() -> None:
-    """The rotor kit's displacements under one force, with 60 µs between channels not stated in its file."""
-    sensors = [one for one in LAB.sensors if not one.name.endswith("_dot")]
-    late = [
-        one if one.name == "theta" else one.model_copy(update={"delay_us": -60.0 * number})
-        for number, one in enumerate(sensors)
-    ]
-    file, simulated = (LAB.model_copy(update={"sensors": tuple(those)}) for those in (sensors, late))
-    draw = Draw(simulated, SEED, Purpose.EVALUATION, 5, layout=Layout.ONE_SOURCE)
-    scenario = draw_condition(draw, 0).overridden(duration_s=70.0)
-    windows, events = feed(MachineMonitor(Installed(file)), [block for block, _ in blocks(scenario, simulated, 1.0)])
-    assert "the theory does not explain this window" in windows[-1].reason
-    assert "delay of each channel after the one before (-" in windows[-1].suspect
-    (event,) = events
-    assert event.alarm.name == MODEL
-    assert event.alarm.note.endswith(windows[-1].suspect)
-
-
 def test_a_healthy_verdict_names_the_parameters_not_read() -> None:
     """Sensors in one plane only: the bearing has lost stiffness in the other."""
     kit = rotor_kit.LAB
     seen = [number for number, one in enumerate(kit.sensors) if one.name[0] in "yt"]
     file = kit.model_copy(update={"sensors": tuple(kit.sensors[number] for number in seen)})
-    softer = stream(70.0, Event(at_s=0.0, parameter="k_bz", relative_change=-0.3))
+    softer = stream(63.0, Event(at_s=0.0, parameter="k_bz", relative_change=-0.3))
     windows, events = feed(
         MachineMonitor(install(file, None)), [replace(one, samples=one.samples[:, seen]) for one in softer]
     )

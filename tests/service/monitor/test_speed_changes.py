@@ -65,7 +65,7 @@ def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(to: float
     assert states.count(HealthState.HEALTHY) >= len(states) - 1
 
 
-def drive(seed: int, *events: Event, duration_s: float = 130.0) -> list[SampleBlock]:
+def drive(seed: int, *events: Event, duration_s: float = 100.0) -> list[SampleBlock]:
     scenario = load_scenario("healthy")[0].model_copy(update={"seed": seed, "events": events, "duration_s": duration_s})
     return [block for block, _ in blocks(scenario, WITHOUT_ANGLE)]
 
@@ -85,7 +85,7 @@ def test_at_level_none_a_drive_is_judged_at_each_set_point() -> None:
     changes = [Event(at_s=67.0, speed_rpm=1.15 * RPM, ramp_s=6.0), Event(at_s=170.0, speed_rpm=RPM)]
     changes += [Event(at_s=100.0, parameter="k_by", relative_change=-0.25)]
     monitor = MachineMonitor(commissioned_at_both_speeds())
-    windows, events = feed(monitor, drive(5_290_020, *changes, duration_s=225.0))
+    windows, events = feed(monitor, drive(5_290_020, *changes, duration_s=205.0))
     raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"k_by"}
     assert {window.state for window in windows if window.filled == 1.0} >= {HealthState.HEALTHY}

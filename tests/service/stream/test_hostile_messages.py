@@ -415,7 +415,7 @@ def test_no_parameter_is_blamed_if_the_file_is_of_another_rotor(factors: tuple[f
 def test_wrong_units_raise_a_model_alarm_and_not_unbalance(gain: float, unbalance: float, name: str) -> None:
     machine = load_machine("lab")
     rotor = machine.rotor.model_copy(update={"e_m": unbalance * machine.rotor.e_m})
-    samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 80.0).copy()
+    samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 70.0).copy()
     samples[:, [channel.name != "theta" for channel in machine.sensors]] *= gain
     monitor = MachineMonitor(install(machine, None))
     _, events = feed(monitor, as_blocks(machine, samples))
