@@ -48,13 +48,13 @@ typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[a
 
 _LONGEST = (
     "test_browser", "test_browser_replays", "test_fleet", "test_shards", "test_hosts", "test_evidence",
-    "test_browser_plots", "test_window_again", "test_tutorial", "test_refused", "test_campaigns", "test_recorder",
+    "test_browser_plots", "test_window_again", "test_tutorial", "test_refused", "test_recorder",
     "test_history_lost", "test_training", "test_scenarios", "test_sequential", "test_commissioned", "test_overload",
     "test_baseline_coupling", "test_monitor_standstill", "test_baseline_growth", "test_baseline", "test_unbalance",
     "test_baseline_force", "test_packages", "test_damping_bound", "test_rotorsim", "test_demo", "test_installation_cli",
     "test_page_types", "test_replay_cli", "test_browser_administration", "test_commission_cli", "test_openapi",
     "test_recorder_killed", "test_compose", "test_conditions", "test_pins", "test_survives", "test_commission_page",
-    "test_interleaving", "test_replay_identity",
+    "test_replay_identity",
 )  # fmt: skip
 """Modules that take long for the number of their tests, longest first."""
 

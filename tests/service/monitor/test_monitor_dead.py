@@ -32,7 +32,7 @@ def dying(
         yield replace(block, samples=samples)
 
 
-@pytest.mark.parametrize(("columns", "value"), [([0], 12e-6), ([2, 5], np.nan)])
+@pytest.mark.parametrize(("columns", "value"), [([0], 12e-6), pytest.param([2, 5], np.nan, marks=pytest.mark.long)])
 def test_a_change_is_named_without_the_dead_sensors(columns: list[int], value: float) -> None:
     installed = install(KIT, None)
     monitor = MachineMonitor(installed, remembered=True)

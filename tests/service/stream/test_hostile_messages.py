@@ -374,7 +374,7 @@ def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]
 
 
 CASES = [
-    *(pytest.param("lab", kind, SEED, marks=LONG if kind == "two sines" else ()) for kind in FOREIGN),
+    *(pytest.param("lab", kind, SEED, marks=LONG if kind in ("two sines", "drift") else ()) for kind in FOREIGN),
     # A sine far from every mode of the lightly damped machine looks like the one resonance of a softer shaft.
     *(pytest.param(name, kind, SEED + 2, marks=LONG) for name in ("heavy", "light") for kind in FOREIGN),
 ]

@@ -38,8 +38,8 @@ from tests.service.rig.replaying import lines_of
 from tests.service.rig.watching import feed, named, raised, resumed
 
 S = 10**9
-LOUD_FROM_S, LOUD_TO_S = 40, 65
-LENGTH_S = 210.0  # long enough for the alarm to clear after the backlog
+LOUD_FROM_S, LOUD_TO_S = 60, 90
+LENGTH_S = 235.0  # long enough for the alarm to clear after the backlog
 LIMIT = '\n[[levels.limits]]\nchannel = "y1"\nmeasure = "overall"\nalert = 220.0\ndanger = 1000.0\n'
 
 
