@@ -27,13 +27,11 @@ from models.ingest import Admission, Gate, Reason, lasting
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.health import HealthState, Quality, Report
-from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.alarm import AlarmEvent, OperatorAction
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
-from service.monitor.alarms.operation import OperatorAction
-from service.monitor.parts import divided, joined
 from service.monitor.reporting import WindowReporter
-from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted
+from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, divided, joined
 
 
 class MachineMonitor:

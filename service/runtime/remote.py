@@ -13,13 +13,7 @@ from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.records import StoreError
 from service.history.store import Store
-from service.monitor.alarms.operation import (
-    NotInTime,
-    OperationConflict,
-    OperationRefused,
-    OperatorAction,
-    UnknownAlarm,
-)
+from service.monitor.alarms.alarm import NotInTime, OperationConflict, OperationRefused, OperatorAction, UnknownAlarm
 from service.monitor.reports import Identity
 from service.runtime.standing import EVENTS, Question, Standing, latest_from_bytes
 from service.settings.service import MachineEntry

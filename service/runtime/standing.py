@@ -15,7 +15,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import Parameter, SensorFault
 from service.analysis.snapshots.heading import LatestData
-from service.monitor.alarms.operation import OperatorAction
+from service.monitor.alarms.alarm import OperatorAction
 from service.stream.monitored import MachineStatus
 
 _PARTS: dict[str, Any] = {kind.__name__: kind for kind in (LatestData, WindowStatistics, Waveform, SampleBlock)}

@@ -19,9 +19,9 @@ from service.history.records import (
     StoredReport,
     StoreError,
 )
-from service.monitor.alarm_conversion import alarm_cloud_event, rfc3339
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
+from service.monitor.conversion import alarm_cloud_event, rfc3339
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 

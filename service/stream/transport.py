@@ -29,8 +29,7 @@ from models.signals.keys import PREFIX, MachineKeys, Topic
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
-from service.stream.inbox import RawBlock
-from service.stream.intake import Intake
+from service.stream.inbox import Intake, RawBlock
 from service.stream.log_query import read_log_query
 from service.stream.subscription import BlockSubscription
 from service.terminal.logs import logger

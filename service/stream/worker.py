@@ -24,19 +24,17 @@ from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion
-from service.monitor.alarm_conversion import alarm_cloud_event, alarm_log_page, alarm_states
-from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.alarm import AlarmEvent, NotInTime, OperatorAction
 from service.monitor.alarms.book import NO_ALARMS
-from service.monitor.alarms.operation import NotInTime, OperatorAction
+from service.monitor.conversion import alarm_cloud_event, alarm_log_page, alarm_states
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
-from service.stream.data_clock import DataClock
 from service.stream.inbox import Inbox, RawBlock
-from service.stream.liveness import COMPUTER, Clocks, Pulse
+from service.stream.liveness import COMPUTER, Clocks, DataClock, Pulse
 from service.stream.monitored import MachineStatus
 from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger

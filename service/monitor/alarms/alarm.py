@@ -1,11 +1,13 @@
-"""An alarm, what happens to it, and the sentences operators read."""
+"""An alarm, what happens to it, the sentences operators read, and what they do to it."""
 
 from dataclasses import dataclass
 
 from models.alarm_names import alarm_kind
 from models.diagnosis.readings import Z95, percent_digits
+from models.errors import RotorwatchError
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
+from rotorwatch.records.operations import OperationKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,3 +103,45 @@ class AlarmEvent:
                 return f"cleared: {what} is no longer named as changed; it reads {size}"
             case _:
                 return f"cleared: {what} is back {alarm_kind(alarm.name).cleared} at {size}"
+
+
+KIND_OF_EVENT: dict[OperationKind, EventKind] = {
+    "acknowledge": EventKind.ACKNOWLEDGED,
+    "reset": EventKind.RESET,
+    "shelve": EventKind.SHELVED,
+    "unshelve": EventKind.UNSHELVED,
+    "remove-from-service": EventKind.REMOVED_FROM_SERVICE,
+    "return-to-service": EventKind.RETURNED_TO_SERVICE,
+}
+"""The event that each operation makes in the life cycle and in the log."""
+
+
+class UnknownAlarm(RotorwatchError):  # noqa: N818  # said to an operator, by its name
+    """There is no alarm of this name; the message lists those there are."""
+
+
+class OperationRefused(RotorwatchError):  # noqa: N818
+    """The alarm is in a state in which this cannot be done; the message says which."""
+
+
+class OperationConflict(RotorwatchError):  # noqa: N818
+    """The alarm is no longer as the operator saw it; the message says how it is."""
+
+
+class NotInTime(RotorwatchError):  # noqa: N818
+    """The machine's thread did not get round to what was asked; whether it will be done is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorAction:
+    """Something an operator wants done to an alarm."""
+
+    kind: OperationKind
+    alarm: str
+    # Who, and why; a reason is needed for shelving and for taking out of service.
+    actor: str
+    reason: str = ""
+    duration_s: float | None = None  # for how long to shelve; None: as long as the machine file allows
+    one_shot: bool = False  # shelve only until the condition clears
+    expected_state: str | None = None  # state in which the operator saw it
+    expected_version: int | None = None  # its `version` when the operator saw it

@@ -23,15 +23,16 @@ from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 from rotorwatch.records.windows import Candidate, Verdict
-from service.monitor.alarms.alarm import Alarm, AlarmEvent
-from service.monitor.alarms.life_cycle import follow, owed_after
-from service.monitor.alarms.operation import (
+from service.monitor.alarms.alarm import (
     KIND_OF_EVENT,
+    Alarm,
+    AlarmEvent,
     OperationConflict,
     OperationRefused,
     OperatorAction,
     UnknownAlarm,
 )
+from service.monitor.alarms.life_cycle import follow, owed_after
 
 _LEAST_KEPT_PROBABILITY = 0.5
 """Probability below which a parameter that was named is no longer taken to have changed."""

@@ -17,7 +17,7 @@ from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Report
 from rotorwatch.records.replays import OfflineSummary, ParameterLimits, ReplayProgress
-from service.monitor.alarm_conversion import alarm_cloud_event
+from service.monitor.conversion import alarm_cloud_event
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorReport

@@ -15,8 +15,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
 from rotorwatch.records.health import Health
 from service.history.records import StoreError
-from service.stream.inbox import Inbox, RawBlock
-from service.stream.intake import Intake
+from service.stream.inbox import Inbox, Intake, RawBlock
 from service.stream.transport import MachineCallbacks, MachineLink, TopicMessage, follow
 from tests.service.rig.live import (
     LAB,
