@@ -26,7 +26,16 @@ _REPLAYED = "a replay is announced on this machine's own keys: replayed data are
 
 def alarm_entries(alarms: Iterable[Alarm], *, include_normal: bool = False) -> tuple[AlarmJson, ...]:
     """Alarms as they are now; normal ones without a running on-delay only if asked for."""
-    return tuple(_alarm(alarm) for alarm in alarms if include_normal or alarm.open)
+    return tuple(
+        AlarmJson(
+            **_of_alarm(AlarmJson, alarm),
+            text=alarm_kind(alarm.name).text,
+            pending=alarm.beyond_ns is not None,
+            clearing=alarm.small_ns is not None,
+        )
+        for alarm in alarms
+        if include_normal or alarm.open
+    )
 
 
 def alarm_states(
@@ -48,11 +57,9 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     place = f"{identity['site']}/{identity['machine']}"
     data = AlarmEventData(
         **identity,
-        **_shared(AlarmEventData, alarm),
+        **_of_alarm(AlarmEventData, alarm),
         **_shared(AlarmEventData, event),
         annunciated=alarm.state.annunciated,
-        relative_change=alarm.change,
-        interval_95=_interval(alarm),
         program_version=__version__,
     )
     return AlarmCloudEvent(
@@ -68,25 +75,15 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     )
 
 
-def _alarm(alarm: Alarm) -> AlarmJson:
-    return AlarmJson(
-        **_shared(AlarmJson, alarm),
-        text=alarm_kind(alarm.name).text,
-        pending=alarm.beyond_ns is not None,
-        clearing=alarm.small_ns is not None,
-        relative_change=alarm.change,
-        interval_95=_interval(alarm),
-    )
+def _of_alarm(record: type[Record], alarm: Alarm) -> dict[str, Any]:
+    change, error = finite(alarm.change), finite(alarm.standard_error)
+    interval = None if change is None or error is None else interval_95(change, error, least=-1.0)
+    return _shared(record, alarm) | {"relative_change": alarm.change, "interval_95": interval}
 
 
 def _shared(record: type[Record], known: Alarm | AlarmEvent) -> dict[str, Any]:
     """Fields of a record that an alarm or event has under the same name."""
     return {name: getattr(known, name) for name in record.model_fields if hasattr(known, name)}
-
-
-def _interval(alarm: Alarm) -> tuple[float, float] | None:
-    change, error = finite(alarm.change), finite(alarm.standard_error)
-    return None if change is None or error is None else interval_95(change, error, least=-1.0)
 
 
 def rfc3339(time_ns: int) -> str:
@@ -108,10 +105,9 @@ def health(  # noqa: PLR0913  # what the worker counts
     restart: str = "",
 ) -> Health:
     """Convert a machine's health; silence decides the state only if no alarm is raised, but is always stated."""
-    silence = ""
-    if stream.silent:
-        since_ns = stream.silent_since_ns
-        silence = f"no data since {'the monitor started' if since_ns is None else rfc3339(since_ns)[:19] + 'Z'}"
+    since_ns = stream.silent_since_ns
+    since = "the monitor started" if since_ns is None else f"{rfc3339(since_ns)[:19]}Z"
+    silence = f"no data since {since}" if stream.silent else ""
     quality = record.quality
     if unread_messages:
         refused = quality.refused_blocks | {"unread": unread_messages}
@@ -155,10 +151,7 @@ def detectable_changes(
 ) -> DetectableChanges:
     """State the smallest changes that the latest window would have shown, and how much data finding `change` takes."""
     latest = record.latest
-    found = () if latest is None else latest.detectable
-    reason = ""
-    if not found:
-        reason = f"window {record.filled:.0%} full" if latest is None or not latest.reason else latest.reason
+    found, reason = ((), "") if latest is None else (latest.detectable, latest.reason)
     return DetectableChanges(
         **identity,
         window_end_ns=None if latest is None else latest.end_ns,
@@ -175,5 +168,5 @@ def detectable_changes(
             )
             for one in found
         ),
-        reason=reason,
+        reason="" if found else reason or f"window {record.filled:.0%} full",
     )

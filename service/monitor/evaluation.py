@@ -83,10 +83,6 @@ class Evaluation:
             for one in deciding.parameters
         )
 
-    @property
-    def _fits_badly(self) -> bool:
-        return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
-
     def rivals(self, foreign: Foreign) -> tuple[str, ...]:
         """Stiffness and damping of a place, if a change of one explains the window as well as a wrong gain there.
 
@@ -124,7 +120,8 @@ class Evaluation:
         The first suspect is what no change of a parameter makes (`foreign`, empty if nothing). Where the window fits
         badly, channels at the end of their range come next, except `faulty` ones, which the evaluation left out.
         """
-        told = foreign or self.shapes or not self._fits_badly
+        fits_badly = self.deciding.unexplained or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
+        told = foreign or self.shapes or not fits_badly
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
         suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
@@ -160,10 +157,7 @@ class WindowEvaluator(ABC):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one full window and, given `newest`, also its latest hops on their own.
 
-        Raises
-        ------
-        EstimationError
-            If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
+        Raises `EstimationError`: outside the speed range, speed not steady, no fluctuation in a channel.
         """
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
@@ -184,10 +178,7 @@ class WindowEvaluator(ABC):
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from where `checkpoint` was called: the next evaluations are the same to the last bit.
 
-        Raises
-        ------
-        CheckpointError
-            If the arrays are not those of such an evaluator of this machine; nothing is changed then.
+        Raises `CheckpointError` if the arrays are not those of such an evaluator of this machine, and changes nothing.
         """
         if arrays:
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
@@ -201,12 +192,8 @@ def left_out(finding: SensorFault) -> SensorFault:
 def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:
     """Leave out hops in which a drive changed its set point; return the window and the number of hops after the last.
 
-    Without a shaft angle the rotation cannot be removed from those hops. `place` is the machine's title.
-
-    Raises
-    ------
-    EstimationError
-        If less than `LEAST_SETTLED` of the hops is left.
+    Without a shaft angle the rotation cannot be removed from those hops. `place` is the machine's title. Raises
+    `EstimationError` if less than `LEAST_SETTLED` of the hops is left.
     """
     passed = np.flatnonzero(~window.settled)
     if newest is None or not passed.size:

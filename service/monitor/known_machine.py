@@ -115,8 +115,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
         elif self._explained_ns is None and not self._commissioned:
-            unexplained = f"{deciding.unexplained}; if this is its healthy state, commission it"
-            deciding = replace(deciding, unexplained=unexplained)
+            advice = "if this is its healthy state, commission it"
+            deciding = replace(deciding, unexplained=f"{deciding.unexplained}; {advice}")
         equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:
@@ -145,9 +145,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         try:
             return self._decide(window, self._likelihood.window)
         except UnexplainedError as error:
-            reason = str(error)
-            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
-            return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=reason)
+            nothing = tuple(no_reading(name, self.by, str(error)) for name in PARAMETERS)
+            return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=str(error))
 
     def _try_other_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
         """The diagnosis with the sense of the gyroscopic moments that explains the window; `given` if neither does.
@@ -195,12 +194,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Return the diagnosis, unless it fits badly and the speed changed too fast for the rotation to be removed.
 
         A shaft that is switched off, or changes its speed at once, leaves part of its rotation in a hop or two. A
-        diagnosis that fits all the same is accepted.
-
-        Raises
-        ------
-        EstimationError
-            If it fits badly, and the speed changed too fast or the rotation was not found in every hop.
+        diagnosis that fits all the same is accepted. Raises `EstimationError` if it fits badly, and the speed changed
+        too fast or the rotation was not found in every hop.
         """
         if not decided.unexplained and (decided.misfit_z or 0.0) <= _MOST_MISFIT_Z:
             return decided
@@ -244,9 +239,12 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Starting points of the likelihood search, and what was found out so far; networks have no state."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
         sense = [self._sense_open, self._sense_opposite, self._tried_in_vain, self._tried_ns, self._angle_unchecked]
-        known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
-        known |= {_ROTATION: np.array(self._rotation.power)}
-        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {
+            _EXPLAINED: explained,
+            _SENSE: np.array(sense, dtype=np.int64),
+            _DIRECTED: np.array(self.directed),
+            _ROTATION: np.array(self._rotation.power),
+        }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from where `checkpoint` was called, see `WindowEvaluator`."""

@@ -70,39 +70,32 @@ class AlarmEvent:
     @property
     def text(self) -> str:
         """The event in a sentence."""
-        alarm = self.alarm
-        words = alarm_kind(alarm.name).text
-        match self.kind:
-            case EventKind.RAISED | EventKind.ESCALATED | EventKind.CLEARED:
-                hidden = "" if alarm.state.annunciated else f" ({alarm.state.value})"
-                return self._about_condition() + hidden
+        alarm, words = self.alarm, alarm_kind(self.alarm.name).text
+        what = f"{words} ({alarm.name})" if alarm.name in PARAMETER_TEXT else words
+        if self.kind in {EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED}:
+            hidden = "" if alarm.state.annunciated else f" ({alarm.state.value})"
+            return self._about_condition(what) + hidden
         who = f" by {self.actor}" if self.actor else ""
         why = f": {self.reason}" if self.reason else ""
-        what = f"{words} ({alarm.name})" if alarm.name in PARAMETER_TEXT else words
         return f"{self.kind.value.replace('-', ' ')}{who}: {what}{why}"
 
-    def _about_condition(self) -> str:
-        alarm = self.alarm
-        words = alarm_kind(alarm.name).text
+    def _about_condition(self, what: str) -> str:
+        alarm, kind = self.alarm, alarm_kind(self.alarm.name)
         if alarm.name not in PARAMETER_TEXT:
             if self.kind is EventKind.CLEARED:
-                return f"cleared: {alarm_kind(alarm.name).cleared}"
-            said = alarm.note or alarm_kind(alarm.name).raised
-            return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
-        what = f"{words} ({alarm.name})"
+                return f"cleared: {kind.cleared}"
+            said = alarm.note or kind.raised
+            return f"{alarm.severity.upper()}: {what}" + (f": {said}" if said else "")
         half = Z95 * (alarm.standard_error or 0.0)
         digits = percent_digits(half)
         size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
         reserve = " (low confidence: another cause is possible)" if alarm.low_confidence else ""
-        match self.kind:
-            case EventKind.RAISED:
-                return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"
-            case EventKind.ESCALATED:
-                return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
-            case _ if alarm.taken_back:
-                return f"cleared: {what} is no longer named as changed; it reads {size}"
-            case _:
-                return f"cleared: {what} is back {alarm_kind(alarm.name).cleared} at {size}"
+        if self.kind is not EventKind.CLEARED:
+            how = "by" if self.kind is EventKind.RAISED else "further, now"
+            return f"{alarm.severity.upper()}: {what} changed {how} {size}{reserve}"
+        if alarm.taken_back:
+            return f"cleared: {what} is no longer named as changed; it reads {size}"
+        return f"cleared: {what} is back {kind.cleared} at {size}"
 
 
 KIND_OF_EVENT: dict[OperationKind, EventKind] = {
