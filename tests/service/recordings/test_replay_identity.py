@@ -15,8 +15,8 @@ from models.signals.link import LinkSettings
 from models.signals.recording import read_recording
 from rotorwatch.records.replays import OfflineSummary
 from service.monitor.monitor import MachineMonitor
-from service.recordings.replay.control import Control
 from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.player import Control
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import running
 from service.stream.replay_link import replay_to_network
