@@ -13,7 +13,7 @@ from models.physics.rotor import PARAMETER_TEXT
 from models.signals.keys import Key
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
-from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData
 from rotorwatch.records.fields import Record, finite
 from rotorwatch.records.health import Health, HealthState, StreamStatus
 from rotorwatch.records.machines import Channel, DetectableChanges, DetectableParameter, MachineDescription
@@ -36,13 +36,6 @@ def alarm_entries(alarms: Iterable[Alarm], *, include_normal: bool = False) -> t
         for alarm in alarms
         if include_normal or alarm.open
     )
-
-
-def alarm_states(
-    identity: Identity, alarms: Iterable[Alarm], sequence: int, *, include_normal: bool = False
-) -> AlarmStates:
-    """Convert the alarms of a machine; `sequence` is that of its latest event."""
-    return AlarmStates(**identity, alarms=alarm_entries(alarms, include_normal=include_normal), sequence=sequence)
 
 
 def alarm_log_page(identity: Identity, texts: Sequence[str], latest: int) -> str:
@@ -132,7 +125,6 @@ def health(  # noqa: PLR0913  # what the worker counts
 def machine_description(identity: Identity, machine: MachineFile, state: HealthState) -> MachineDescription:
     """Convert a machine file."""
     keys = machine.keys
-    names = [name for name, value in vars(type(keys)).items() if isinstance(value, Key)]
     return MachineDescription(
         **identity,
         description=machine.description,
@@ -142,7 +134,7 @@ def machine_description(identity: Identity, machine: MachineFile, state: HealthS
         channels=tuple(Channel.model_validate(channel.model_dump(mode="json")) for channel in machine.sensors),
         window_length_s=machine.window.length_s,
         window_hop_s=machine.window.hop_s,
-        keys={name: getattr(keys, name) for name in names},
+        keys={name: getattr(keys, name) for name, value in vars(type(keys)).items() if isinstance(value, Key)},
     )
 
 

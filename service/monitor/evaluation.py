@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -61,17 +61,6 @@ class Evaluation:
         return HealthState.NOT_EVALUABLE
 
     @property
-    def read(self) -> dict[str, Any]:
-        """Fields that a report takes over unchanged."""
-        return {
-            "speed_rad_s": self.speed_rad_s,
-            "parameters": self.readings,
-            "equations": self.equations,
-            "opinions": self.opinions,
-            "gyroscopic": self.gyroscopic,
-        }
-
-    @property
     def readings(self) -> tuple[Parameter, ...]:
         """Readings of the deciding diagnostician: none of an unexplained window, no unbalance if 1x is foreign."""
         deciding, vector = self.deciding, self.deciding.unbalance
@@ -125,13 +114,8 @@ class Evaluation:
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
         suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
-        return replace(
-            self,
-            deciding=replace(self.deciding, suspect=suspect),
-            shapes=tuple(
-                one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes
-            ),
-        )
+        shapes = tuple(one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes)
+        return replace(self, deciding=replace(self.deciding, suspect=suspect), shapes=shapes)
 
 
 class WindowEvaluator(ABC):
@@ -157,7 +141,10 @@ class WindowEvaluator(ABC):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one full window and, given `newest`, also its latest hops on their own.
 
-        Raises `EstimationError`: outside the speed range, speed not steady, no fluctuation in a channel.
+        Raises
+        ------
+        EstimationError
+            If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
@@ -178,22 +165,24 @@ class WindowEvaluator(ABC):
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from where `checkpoint` was called: the next evaluations are the same to the last bit.
 
-        Raises `CheckpointError` if the arrays are not those of such an evaluator of this machine, and changes nothing.
+        Raises
+        ------
+        CheckpointError
+            If the arrays are not those of such an evaluator of this machine; nothing is changed then.
         """
         if arrays:
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
 
 
-def left_out(finding: SensorFault) -> SensorFault:
-    """The finding, with the remark that the machine is diagnosed without that sensor."""
-    return finding.model_copy(update={"text": f"{finding.text}; the machine is diagnosed without it"})
-
-
 def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:
     """Leave out hops in which a drive changed its set point; return the window and the number of hops after the last.
 
-    Without a shaft angle the rotation cannot be removed from those hops. `place` is the machine's title. Raises
-    `EstimationError` if less than `LEAST_SETTLED` of the hops is left.
+    Without a shaft angle the rotation cannot be removed from those hops. `place` is the machine's title.
+
+    Raises
+    ------
+    EstimationError
+        If less than `LEAST_SETTLED` of the hops is left.
     """
     passed = np.flatnonzero(~window.settled)
     if newest is None or not passed.size:

@@ -194,8 +194,12 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Return the diagnosis, unless it fits badly and the speed changed too fast for the rotation to be removed.
 
         A shaft that is switched off, or changes its speed at once, leaves part of its rotation in a hop or two. A
-        diagnosis that fits all the same is accepted. Raises `EstimationError` if it fits badly, and the speed changed
-        too fast or the rotation was not found in every hop.
+        diagnosis that fits all the same is accepted.
+
+        Raises
+        ------
+        EstimationError
+            If it fits badly, and the speed changed too fast or the rotation was not found in every hop.
         """
         if not decided.unexplained and (decided.misfit_z or 0.0) <= _MOST_MISFIT_Z:
             return decided

@@ -188,7 +188,10 @@ class LevelWatch:
     def restore(self, arrays: Mapping[str, np.ndarray], *, first_alone: bool) -> None:
         """Continue from a checkpoint, or (`first_alone`) from its first windows only, which outlast a commissioning.
 
-        Raises `CheckpointError` if the arrays are damaged, or of other channels.
+        Raises
+        ------
+        CheckpointError
+            If the arrays are damaged, or of other channels.
         """
         self._first.restore(arrays)
         if not first_alone:

@@ -275,8 +275,12 @@ class MachineMonitor:
     def restore(self, state: bytes, parts: Collection[bytes] = (), *, levels_alone: bool = False) -> None:
         """Continue from the state of a monitor of the same machine, files and version; alarms are restored separately.
 
-        With `levels_alone` files and version may differ: only the levels of the first windows are restored. Raises
-        `CheckpointError` if the bytes are damaged or of another form; this monitor is of no use then.
+        With `levels_alone` files and version may differ: only the levels of the first windows are restored.
+
+        Raises
+        ------
+        CheckpointError
+            If the bytes are damaged or of another form; this monitor is of no use then.
         """
         arrays, hops = joined(state, parts)
         self._levels.restore(unprefixed("levels", arrays), first_alone=levels_alone)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
@@ -34,12 +35,8 @@ class Identity(TypedDict):
 def identity_of(installed: Installed) -> Identity:
     """Identity of a machine with what it is monitored with."""
     machine = installed.machine
-    return {
-        "site": machine.site,
-        "machine": machine.name,
-        "bundle": installed.identity,
-        "machine_hash": machine_hash(machine),
-    }
+    hashed = machine_hash(machine)
+    return Identity(site=machine.site, machine=machine.name, bundle=installed.identity, machine_hash=hashed)
 
 
 def machine_hash(machine: MachineFile) -> str:
@@ -51,11 +48,10 @@ def machine_hash(machine: MachineFile) -> str:
 def counted(quality: Quality, verdict: Admission) -> Quality:
     """Count one more block that was refused, or before which data are missing."""
     if verdict.reason is not None:
-        refused = {**quality.refused_blocks}
-        refused[verdict.reason.value] = refused.get(verdict.reason.value, 0) + 1
-        return quality.model_copy(
-            update={"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
-        )
+        refused = Counter(quality.refused_blocks)
+        refused[verdict.reason.value] += 1
+        counts = {"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
+        return quality.model_copy(update=counts)
     gap = {"gaps": quality.gaps + 1, "missing_s": quality.missing_s + verdict.gap_s, "last_gap": verdict.text}
     return quality.model_copy(update=gap)
 

@@ -2,7 +2,7 @@
 
 A reading calls for an alarm's condition to begin (*beyond* its limit) or to end (*small* again). In the deadband
 between the two limits, and where nothing was read, it calls for neither: missing data neither raise nor clear. What is
-called for throughout the on-delay or off-delay, in data time, happens; `service.monitor.alarms.life_cycle` gives the
+called for throughout the on-delay or off-delay, in data time, happens; `service.monitor.alarms.alarm.TABLE` gives the
 alarm's next state.
 
 A parameter is beyond its limit if the sequential test names it as changed, almost certainly, by more than that limit.
@@ -31,8 +31,9 @@ from service.monitor.alarms.alarm import (
     OperationRefused,
     OperatorAction,
     UnknownAlarm,
+    follow,
+    owed_after,
 )
-from service.monitor.alarms.life_cycle import follow, owed_after
 
 _LEAST_KEPT_PROBABILITY = 0.5
 """Probability below which a parameter that was named is no longer taken to have changed."""
@@ -345,7 +346,12 @@ class AlarmBook:
         """Continue from what `checkpoint` returned.
 
         The log's number of the next event may be ahead of the checkpoint's; it is behind only if the log was begun
-        anew. Raises `CheckpointError` if the text is not of this form.
+        anew.
+
+        Raises
+        ------
+        CheckpointError
+            If the text is not of this form.
         """
         try:
             page = _PAGE.validate_json(text)
