@@ -9,12 +9,11 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from importlib.resources import files
-from pathlib import Path
 
 from models.commissioning.commissioned import Installed, install
+from models.diagnosis.networks.bundle import MANIFEST, SHIPPED_BUNDLES
 from models.errors import MachineFileError, RecordingError
-from models.machine import MachineFile, load_machine_file
+from models.machine import SHIPPED_MACHINES, MachineFile, load_machine_file
 from models.mistakes import changed, checked, parse_toml
 from models.physics.rotor import PARAMETERS
 from models.signals.keys import MachineKeys
@@ -190,13 +189,14 @@ def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> 
         else:
             file, _, name = wanted.partition("@")
         return install(load_machine_file(file, changes), name or None)
-    for path in _shipped_files():
+    shipped = sorted(SHIPPED_MACHINES.glob("*.toml"))
+    for path in shipped:
         machine = load_machine_file(path)
         if (machine.site, machine.name) == (keys.site, keys.machine):
             return install(load_machine_file(path, changes), path.stem if is_shipped_bundle(path.stem) else None)
-    shipped = ", ".join(path.stem for path in _shipped_files())
+    names = ", ".join(path.stem for path in shipped)
     raise MachineFileError(
-        f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({shipped}) has this site "
+        f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({names}) has this site "
         "and name: name its machine file, as --machine FILE or --machine FILE@BUNDLE"
     )
 
@@ -222,14 +222,9 @@ def check_sent(text: str, changes: str, recorded: str) -> None:
 
 def is_shipped_machine(name: str) -> bool:
     """Whether a machine file of this name is shipped."""
-    return name in {path.stem for path in _shipped_files()}
+    return name in {path.stem for path in SHIPPED_MACHINES.glob("*.toml")}
 
 
 def is_shipped_bundle(name: str) -> bool:
     """Whether trained networks of this name are shipped."""
-    folder = Path(str(files("models"))) / "bundles"
-    return name in {path.name for path in folder.iterdir() if (path / "manifest.json").is_file()}
-
-
-def _shipped_files() -> list[Path]:
-    return sorted((Path(str(files("models"))) / "machines").glob("*.toml"))
+    return name in {path.name for path in SHIPPED_BUNDLES.iterdir() if (path / MANIFEST).is_file()}
