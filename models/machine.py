@@ -25,7 +25,7 @@ from models.signals.keys import MachineKeys
 from models.signals.sensor import Sensor
 from models.stream_settings import IngestSettings, Schedule, WindowSettings, default_window, time_scale, whole
 
-_SHIPPED = Path(__file__).parent / "machines"
+SHIPPED_MACHINES = Path(__file__).parent / "machines"
 
 
 _BINS = 20
@@ -407,10 +407,10 @@ def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFil
 
 def _path(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
-    if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
-        return _SHIPPED / f"{name_or_path}.toml"
+    if path.suffix != ".toml" and (SHIPPED_MACHINES / f"{name_or_path}.toml").is_file():
+        return SHIPPED_MACHINES / f"{name_or_path}.toml"
     if not path.is_file():
-        shipped = sorted(entry.stem for entry in _SHIPPED.glob("*.toml"))
+        shipped = sorted(entry.stem for entry in SHIPPED_MACHINES.glob("*.toml"))
         hint = did_you_mean(path.name, [*shipped, *(entry.name for entry in path.parent.glob("*.toml"))])
         raise MachineFileError(f"{path}: no such machine file; shipped machines: {', '.join(shipped)}{hint}")
     return path

@@ -61,6 +61,7 @@ class RecordedMessage:
 class RecordingSummary:
     """What a recording holds."""
 
+    path: Path
     # Earliest and latest log time; both 0 in an empty recording.
     start_ns: int
     end_ns: int
@@ -247,7 +248,8 @@ def summarize_recording(path: Path) -> RecordingSummary:
         for number, count in summary.statistics.channel_message_counts.items():
             key = summary.channels[number].topic
             counts[key] = counts.get(key, 0) + count
-        return RecordingSummary(summary.statistics.message_start_time, summary.statistics.message_end_time, counts)
+        found = summary.statistics
+        return RecordingSummary(path, found.message_start_time, found.message_end_time, counts)
 
 
 def unpacked(channel: Channel, message: Message) -> RecordedMessage:

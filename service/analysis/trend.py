@@ -22,8 +22,7 @@ from rotorwatch.records.levels import LEVEL_MEASURES
 from service.analysis.past import Past, parsed_reports
 from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
-from service.recordings.replay.machine import choose_machine
-from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.offline import OfflineReplay, choose_machine
 
 SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
 """Events shown in a trend: those caused by the machine, not by what operators did to alarms."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which would delay
     from models.signals.keys import MachineKeys
     from models.signals.link import LinkSettings
     from rotorwatch.records.replays import OfflineSummary
-    from service.recordings.replay.control import Control
+    from service.recordings.replay.player import Control
     from service.recordings.replay.source import RecordingSource
     from service.runtime.archive import MachineTask
     from service.stream.replay_link import NetworkPlan
@@ -162,7 +162,7 @@ def replay(
         os.nice(nice)
     prepare_numerics()
     from service.recordings.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
-    from service.recordings.replay.control import Control  # noqa: PLC0415
+    from service.recordings.replay.player import Control  # noqa: PLC0415
     from service.recordings.replay.source import RecordingSource  # noqa: PLC0415
 
     try:
@@ -224,8 +224,7 @@ def _evaluate(
 ) -> None:
     from rotorwatch.records.replays import ReplayLine  # noqa: PLC0415
     from service.recordings.replay.console import show  # noqa: PLC0415
-    from service.recordings.replay.machine import choose_machine  # noqa: PLC0415  # keeps --help quick
-    from service.recordings.replay.offline import OfflineReplay  # noqa: PLC0415
+    from service.recordings.replay.offline import OfflineReplay, choose_machine  # noqa: PLC0415  # keeps --help quick
 
     as_json = progress == "json"
     if as_json and out is None:

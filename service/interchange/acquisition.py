@@ -24,7 +24,7 @@ from service.interchange.source import (
     equally_long,
     readable,
 )
-from service.monitor.alarm_conversion import rfc3339
+from service.monitor.conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
 _TIME_RESPONSE = 1

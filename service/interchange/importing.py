@@ -28,7 +28,7 @@ from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
 from service.interchange.samples import Piece, Read, pieces, signals_of
 from service.interchange.source import Reference, SourceError
-from service.monitor.alarm_conversion import rfc3339
+from service.monitor.conversion import rfc3339
 
 _NOTED = 0.01  # fraction of rows lost from which a note is given
 _MOST_ALONE = 0.1  # largest fraction of isolated rows, i.e. with a gap on both sides

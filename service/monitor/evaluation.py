@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -61,17 +61,6 @@ class Evaluation:
         return HealthState.NOT_EVALUABLE
 
     @property
-    def read(self) -> dict[str, Any]:
-        """Fields that a report takes over unchanged."""
-        return {
-            "speed_rad_s": self.speed_rad_s,
-            "parameters": self.readings,
-            "equations": self.equations,
-            "opinions": self.opinions,
-            "gyroscopic": self.gyroscopic,
-        }
-
-    @property
     def readings(self) -> tuple[Parameter, ...]:
         """Readings of the deciding diagnostician: none of an unexplained window, no unbalance if 1x is foreign."""
         deciding, vector = self.deciding, self.deciding.unbalance
@@ -82,10 +71,6 @@ class Evaluation:
             no_reading(one.name, one.by, foreign) if foreign and one.vector is not None else one
             for one in deciding.parameters
         )
-
-    @property
-    def _fits_badly(self) -> bool:
-        return self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
 
     def rivals(self, foreign: Foreign) -> tuple[str, ...]:
         """Stiffness and damping of a place, if a change of one explains the window as well as a wrong gain there.
@@ -124,17 +109,13 @@ class Evaluation:
         The first suspect is what no change of a parameter makes (`foreign`, empty if nothing). Where the window fits
         badly, channels at the end of their range come next, except `faulty` ones, which the evaluation left out.
         """
-        told = foreign or self.shapes or not self._fits_badly
+        fits_badly = self.deciding.unexplained or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
+        told = foreign or self.shapes or not fits_badly
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""
         suspect = foreign or ends or with_channel_names(self.deciding.suspect, channels)
-        return replace(
-            self,
-            deciding=replace(self.deciding, suspect=suspect),
-            shapes=tuple(
-                one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes
-            ),
-        )
+        shapes = tuple(one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes)
+        return replace(self, deciding=replace(self.deciding, suspect=suspect), shapes=shapes)
 
 
 class WindowEvaluator(ABC):
@@ -191,11 +172,6 @@ class WindowEvaluator(ABC):
         """
         if arrays:
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
-
-
-def left_out(finding: SensorFault) -> SensorFault:
-    """The finding, with the remark that the machine is diagnosed without that sensor."""
-    return finding.model_copy(update={"text": f"{finding.text}; the machine is diagnosed without it"})
 
 
 def settled(place: str, window: WindowStatistics, newest: Newest | None) -> tuple[WindowStatistics, int]:

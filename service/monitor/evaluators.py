@@ -172,8 +172,7 @@ class BaselineEvaluator(WindowEvaluator):
         """The baseline that was learned in the window's conditions."""
         reasons = []
         for conditions, baseline in self._baselines:
-            outside = conditions.outside(window, self._naming)
-            if not outside:
+            if not (outside := conditions.outside(window, self._naming)):
                 return baseline
             reasons.append(outside)
         raise EstimationError(f"{self._place}: not evaluable here: {'; '.join(reasons)}")

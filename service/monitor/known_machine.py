@@ -117,8 +117,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if not deciding.unexplained:
             self._explained_ns = window.end_ns
         elif self._explained_ns is None and not self._commissioned:
-            unexplained = f"{deciding.unexplained}; if this is its healthy state, commission it"
-            deciding = replace(deciding, unexplained=unexplained)
+            advice = "if this is its healthy state, commission it"
+            deciding = replace(deciding, unexplained=f"{deciding.unexplained}; {advice}")
         equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:
@@ -147,9 +147,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         try:
             return self._decide(window, self._likelihood.window)
         except UnexplainedError as error:
-            reason = str(error)
-            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
-            return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=reason)
+            nothing = tuple(no_reading(name, self.by, str(error)) for name in PARAMETERS)
+            return Diagnosis(self.by, nothing, covariance=np.zeros((0, 0)), unexplained=str(error))
 
     def _try_other_sense(self, window: WindowStatistics, given: Diagnosis) -> Diagnosis:
         """The diagnosis with the sense of the gyroscopic moments that explains the window; `given` if neither does.
@@ -246,9 +245,12 @@ class KnownMachineEvaluator(WindowEvaluator):
         """Starting points of the likelihood search, and what was found out so far; networks have no state."""
         explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
         sense = [self._sense_open, self._sense_opposite, self._tried_in_vain, self._tried_ns, self._angle_unchecked]
-        known = {_EXPLAINED: explained, _SENSE: np.array(sense, dtype=np.int64), _DIRECTED: np.array(self.directed)}
-        known |= {_ROTATION: np.array(self._rotation.power)}
-        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | known
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {
+            _EXPLAINED: explained,
+            _SENSE: np.array(sense, dtype=np.int64),
+            _DIRECTED: np.array(self.directed),
+            _ROTATION: np.array(self._rotation.power),
+        }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from where `checkpoint` was called, see `WindowEvaluator`."""

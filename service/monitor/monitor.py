@@ -27,13 +27,11 @@ from models.ingest import Admission, Gate, Reason, lasting
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.health import HealthState, Quality, Report
-from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.alarm import AlarmEvent, OperatorAction
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
-from service.monitor.alarms.operation import OperatorAction
-from service.monitor.parts import divided, joined
 from service.monitor.reporting import WindowReporter
-from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted
+from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, counted, divided, joined
 
 
 class MachineMonitor:
@@ -61,6 +59,7 @@ class MachineMonitor:
         self.machine = machine = installed.machine
         self._skips = skips
         self._alarms = AlarmBook(machine.alarms)
+        self.take_events = self._alarms.take  # those that a defect has kept from being handed over
         self._data_path = DataPathAlarms(self._alarms, machine)
         self._reporter = reporter = WindowReporter(installed, self._alarms, self._data_path, remembered=remembered)
         self.identity, self.watching = reporter.identity, reporter.watching
@@ -90,20 +89,11 @@ class MachineMonitor:
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
     ) -> tuple[MonitorReport, ...]:
-        """Decode a message of the stream, and `step` every block that is in order now.
+        """Decode a message of the stream (`models.signals.wire`), and `step` every block that is in order now.
 
-        Parameters
-        ----------
-        payload, attachment, encoding : bytes, bytes, str
-            See `models.signals.wire`.
-        dropped_before : int
-            Messages before this one that were dropped because this computer could not keep up.
-
-        Returns
-        -------
-        tuple of MonitorReport
-            One per block that was taken: none while a block waits for an earlier one, several when that has come.
-            Undecodable bytes are a refusal like any other.
+        `dropped_before` are messages before this one that were dropped because this computer could not keep up. Returns
+        one report per block that was taken: none while a block waits for an earlier one, several when that has come.
+        Undecodable bytes are a refusal like any other.
         """
         self._dropped += dropped_before
         self.used = False
@@ -180,23 +170,14 @@ class MachineMonitor:
     def _step_due(self) -> tuple[MonitorReport, ...]:
         """Step the blocks that are due; if one raises an error, the others are left for the next call."""
         while self._due:
-            one = self._due.popleft()
-            self._done.append(self.step(one.block, None))
+            self._done.append(self.step(self._due.popleft().block, None))
         done, self._done = tuple(self._done), []
         return done
 
     def step(self, block: SampleBlock, schema_hash: str | None = "") -> MonitorReport:
-        """Take one block: gate, window, evaluation, alarms.
+        """Take one block: gate (which `schema_hash` is for), window, evaluation, alarms.
 
-        Parameters
-        ----------
-        schema_hash : str or None
-            Hash of the channel descriptor the sender named, see `Gate.judge`.
-
-        Returns
-        -------
-        MonitorReport
-            Immutable; refused blocks, gaps and defects of the monitor are stated in it, never raised.
+        Refused blocks, gaps and defects of the monitor are stated in the report, never raised.
         """
         dropped = self._drops.pop((block.run, block.sequence), 0)
         verdict = self._admission_of(block, schema_hash, dropped)
@@ -245,13 +226,7 @@ class MachineMonitor:
         self._data_path.fault(self._fault, time_ns)
 
     def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Take note of time that has passed, with data or without.
-
-        Parameters
-        ----------
-        time_ns : int
-            Best estimate of the data time reached by now.
-        """
+        """Take note of time that has passed, with data or without; `time_ns` estimates the data time reached by now."""
         self._reached_ns = time_ns
         self._alarms.passed(time_ns)
         self._data_path.passed(time_ns, self.end_ns)
@@ -281,10 +256,6 @@ class MachineMonitor:
         """Do what an operator asks for, see `AlarmBook.operate`."""
         self._reached_ns = time_ns
         self._alarms.operate(operation, time_ns)
-        return self._alarms.take()
-
-    def take_events(self) -> tuple[AlarmEvent, ...]:
-        """Hand over alarm events that a defect has kept from being handed over."""
         return self._alarms.take()
 
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
@@ -330,10 +301,7 @@ class MachineMonitor:
     def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
         """Continue with the alarms of another monitor, see `AlarmBook.restore`.
 
-        Parameters
-        ----------
-        end_ns : int, optional
-            End of the newest data of the other monitor, if nothing else of it was restored; on the alarms' clock.
+        `end_ns` is the end of its newest data, on the alarms' clock, if nothing else of it was restored.
         """
         self._alarms.restore(alarms, next_sequence)
         self.end_ns = end_ns if self.end_ns is None else self.end_ns

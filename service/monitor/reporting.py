@@ -24,7 +24,6 @@ from rotorwatch.records.health import HealthState, Report
 from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
-from service.monitor.evaluation import left_out
 from service.monitor.evaluators import evaluator_for
 from service.monitor.levels import LevelWatch
 from service.monitor.reports import identity_of
@@ -87,18 +86,18 @@ class WindowReporter:
             findings += levels.rewired()
         lost = self.evaluator.spared(self._plan, findings)
         if lost and not (stood or skipped):
-            findings = tuple(map(left_out, findings))
+            remark = "the machine is diagnosed without it"
+            findings = tuple(one.model_copy(update={"text": f"{one.text}; {remark}"}) for one in findings)
         start_ns, faulty = statistics.start_ns, implicated(findings)
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         self._data_path.sensors(findings, statistics, standing=bool(stood))
         self.evaluator.heard(findings)
-        seen: dict[str, Any] = {"speed_rad_s": speed, "sensors": findings}
 
         def unread(state: HealthState, reason: str) -> Report:
             levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
             calm = state if lost == () else HealthState.DATA_HEALTH  # a sensor fault takes precedence
-            return self.unread(start_ns, end_ns, calm, **seen, reason=reason)
+            return self.unread(start_ns, end_ns, calm, speed_rad_s=speed, sensors=findings, reason=reason)
 
         if lost is None:
             return unread(HealthState.DATA_HEALTH, "; ".join(each.text for each in findings))
@@ -129,7 +128,12 @@ class WindowReporter:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(
             **self._window_now(start_ns, end_ns, calm),
-            **seen | evaluation.read,
+            speed_rad_s=evaluation.speed_rad_s,
+            sensors=findings,
+            parameters=evaluation.readings,
+            equations=evaluation.equations,
+            opinions=evaluation.opinions,
+            gyroscopic=evaluation.gyroscopic,
             misfit_z=evaluation.deciding.misfit_z,
             suspect=suspect if verdict.outside_model or foreign.hides else "",
             verdict=verdict,

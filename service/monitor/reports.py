@@ -2,14 +2,25 @@
 
 import hashlib
 import json
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TypedDict
 
+import numpy as np
+
+from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
 from models.commissioning.commissioned import Installed
+from models.diagnosis.verdict.sequential_state import hop_arrays
+from models.diagnosis.verdict.stretch import Stretch
 from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
+
+_HOP = "hop "
+_LARGE = 4096
 
 
 class Identity(TypedDict):
@@ -24,12 +35,8 @@ class Identity(TypedDict):
 def identity_of(installed: Installed) -> Identity:
     """Identity of a machine with what it is monitored with."""
     machine = installed.machine
-    return {
-        "site": machine.site,
-        "machine": machine.name,
-        "bundle": installed.identity,
-        "machine_hash": machine_hash(machine),
-    }
+    hashed = machine_hash(machine)
+    return Identity(site=machine.site, machine=machine.name, bundle=installed.identity, machine_hash=hashed)
 
 
 def machine_hash(machine: MachineFile) -> str:
@@ -41,11 +48,10 @@ def machine_hash(machine: MachineFile) -> str:
 def counted(quality: Quality, verdict: Admission) -> Quality:
     """Count one more block that was refused, or before which data are missing."""
     if verdict.reason is not None:
-        refused = {**quality.refused_blocks}
-        refused[verdict.reason.value] = refused.get(verdict.reason.value, 0) + 1
-        return quality.model_copy(
-            update={"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
-        )
+        refused = Counter(quality.refused_blocks)
+        refused[verdict.reason.value] += 1
+        counts = {"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
+        return quality.model_copy(update=counts)
     gap = {"gaps": quality.gaps + 1, "missing_s": quality.missing_s + verdict.gap_s, "last_gap": verdict.text}
     return quality.model_copy(update=gap)
 
@@ -97,3 +103,43 @@ class Tally:
     step_s: float = 0.0  # time spent in the monitor altogether
     commit_s: float = 0.0  # time spent waiting for the history altogether
     data_s: float = 0.0  # length of the data taken altogether
+
+
+def divided(
+    arrays: Mapping[str, np.ndarray], hops: Mapping[int, list[tuple[int, Stretch]]], kept: Collection[str]
+) -> tuple[bytes, tuple[tuple[str, bytes], ...], tuple[str, ...]]:
+    """State, new parts (not in `kept`) by name, and the names of all parts; the hops are `SequentialState.hops`.
+
+    ::
+
+        arrays -- small ------------> state, written with every hop
+               '- 4 kB and more ----> parts, named by a digest of their content: most stay the same for many hops
+        hops of the sequential test -> parts, each named by the hop's end: none changes afterwards
+    """
+    large = {name: array for name, array in arrays.items() if array.nbytes >= _LARGE}
+    names = {f"{_HOP}{end_ns:019}": came for end_ns, came in hops.items()}
+    known = frozenset(kept)
+    parts = {f"{name} {_digest(array)}": {name: array} for name, array in large.items()}
+    parts |= {name: prefixed(name, hop_arrays(came)) for name, came in names.items() if name not in known}
+    return (
+        to_bytes({name: array for name, array in arrays.items() if name not in large}),
+        tuple((name, to_bytes(part)) for name, part in parts.items() if name not in known),
+        (*parts, *(name for name in names if name in known)),
+    )
+
+
+def joined(state: bytes, parts: Iterable[bytes]) -> tuple[dict[str, np.ndarray], list[dict[str, np.ndarray]]]:
+    """Arrays of the monitor, and arrays of each hop of the sequential test, oldest first; raises as `from_bytes`."""
+    arrays, hops = from_bytes(state), []
+    for part in map(from_bytes, parts):
+        name = next(iter(part), "")
+        if name.startswith(_HOP):
+            hops.append((name, unprefixed(name.partition("/")[0], part)))
+        else:
+            arrays |= part
+    return arrays, [hop for _, hop in sorted(hops, key=itemgetter(0))]
+
+
+def _digest(array: np.ndarray) -> str:
+    form = str(array.shape).encode()[:16]
+    return hashlib.blake2b(np.ascontiguousarray(array).data, digest_size=8, person=form).hexdigest()

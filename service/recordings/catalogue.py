@@ -1,4 +1,4 @@
-"""What recordings a directory holds, and finding one of them by its id.
+"""What recordings a directory holds, finding one of them by its id, and which of a machine's are kept.
 
 ::
 
@@ -7,27 +7,37 @@
     <directory>/<site>/<machine>/kept.json                     which files an alarm keeps, and which alarm
 
 Names sort by time. The files' own indexes say everything else, so that files may be copied in and out by hand.
+
+Whole files are kept or dropped, the oldest first. A file that reaches into the time around an alarm event falls under
+the limits for alarms, every other one under the ordinary limits. Times are log times: the computer's clock when a
+message arrived, or when the monitor recorded an event. Only events that a monitor committed to its history count, as
+anybody may send one over the network. A file once kept for an alarm stays so, even if the history is lost. Only files
+named as the recorder names them are ever dropped; one that is renamed stays.
 """
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import Field
 
 from models.errors import RecordingError
-from models.signals.recording import RecordedMessage, read_recording, summarize_recording
+from models.signals.recording import RecordedMessage, read_recording, summarize_recording, writing
 from models.signals.salvage import salvaged_messages
 from models.signals.wire import REPLAY_MARK
 from rotorwatch.records.recordings import RecordingEntry
+from service.history.records import StoredEvent
+from service.settings.service import RecordingSettings
 from service.terminal.logs import logger
 
 _log = logger(part="recordings")
 SUFFIX = ".mcap"
 PART = ".part"
 KEPT = "kept.json"
+_NS = 1_000_000_000
 _PLACE = r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 _PLACE_ONLY = re.compile(_PLACE)
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap(\.part)?")
@@ -43,6 +53,22 @@ class Recording(RecordingEntry):
     """
 
     path: Path = Field(exclude=True)
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmMark:
+    """An alarm event that a monitor committed."""
+
+    time_ns: int  # when it was recorded, by the computer's clock
+    text: str  # what it was, for people
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What retention decided."""
+
+    kept: dict[str, str]  # files that an alarm keeps, by name, with the alarm
+    dropped: tuple[tuple[Recording, str], ...]  # files to be deleted, with the limit they exceed
 
 
 class Catalogue:
@@ -94,29 +120,30 @@ class Catalogue:
         known = self._read.get(path)
         if known is not None and known[:2] == (stat.st_mtime_ns, stat.st_size):
             return known[2]
-        start_ns = start_of(path.name)
+        named_ns, end_ns = start_of(path.name), stat.st_mtime_ns
+        start_ns = end_ns if named_ns is None else named_ns
+        messages: int | None = None
+        complete, problem = path.suffix == SUFFIX, ""
+        if complete:
+            try:
+                summary = summarize_recording(path)
+                if messages := sum(summary.messages.values()):
+                    start_ns, end_ns = summary.start_ns, summary.end_ns
+            except RecordingError as error:
+                problem = str(error)
         recording = Recording(
             id=f"{site}/{machine}/{path.name}",
             site=site,
             machine=machine,
             path=path,
-            start_ns=stat.st_mtime_ns if start_ns is None else start_ns,
-            end_ns=stat.st_mtime_ns,
-            messages=None,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            messages=messages,
             size_bytes=stat.st_size,
-            complete=path.suffix == SUFFIX,
+            complete=complete,
             kept_because="",
-            problem="",
+            problem=problem,
         )
-        if recording.complete:
-            try:
-                summary = summarize_recording(path)
-            except RecordingError as error:
-                recording = recording.model_copy(update={"problem": str(error)})
-            else:
-                count = sum(summary.messages.values())
-                times = {"start_ns": summary.start_ns, "end_ns": summary.end_ns} if count else {}
-                recording = recording.model_copy(update={"messages": count, **times})
         self._read[path] = (stat.st_mtime_ns, stat.st_size, recording)
         return recording
 
@@ -131,7 +158,7 @@ def name_of(start_ns: int, number: int = 1) -> str:
     >>> name_of(1_767_225_600_000_000_000), name_of(1_767_225_600_000_000_000, 2)
     ('20260101T000000Z.mcap', '20260101T000000Z_002.mcap')
     """
-    stamp = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime(_STAMP_FORMAT)
+    stamp = datetime.fromtimestamp(start_ns // _NS, UTC).strftime(_STAMP_FORMAT)
     return stamp + (f"_{number:03d}" if number > 1 else "") + SUFFIX
 
 
@@ -150,7 +177,7 @@ def start_of(name: str) -> int | None:
         stamp = datetime.strptime(match[1], _STAMP_FORMAT).replace(tzinfo=UTC)
     except ValueError:
         return None
-    return int(stamp.timestamp()) * 1_000_000_000
+    return int(stamp.timestamp()) * _NS
 
 
 def kept_reasons(folder: Path) -> dict[str, str]:
@@ -209,3 +236,67 @@ def _messages(path: Path, key: str, since_ns: int) -> Iterator[RecordedMessage]:
                 raise
     if complete.exists() and complete.stat().st_mtime_ns >= since_ns:
         yield from read_recording(complete, keys={key}, from_ns=since_ns)
+
+
+def decide(
+    recordings: Iterable[Recording], marks: Sequence[AlarmMark], settings: RecordingSettings, now_ns: int
+) -> Decision:
+    """Decide which recordings of one machine are kept.
+
+    Incomplete ones are left alone, and so are those that are not named as the recorder names them.
+    """
+    own = [one for one in recordings if one.complete and start_of(one.path.name) is not None]
+    reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings) or one.kept_because)}
+    ordinary = [one for one in own if one.id not in reasons]
+    alarmed = [one for one in own if one.id in reasons]
+    dropped = [
+        *_beyond(ordinary, settings.keep_gb, settings.keep_days, "keep", now_ns),
+        *_beyond(alarmed, settings.alarm_keep_gb, settings.alarm_keep_days, "alarm_keep", now_ns),
+    ]
+    gone = {one.id for one, _ in dropped}
+    return Decision({one.path.name: reasons[one.id] for one in alarmed if one.id not in gone}, tuple(dropped))
+
+
+def alarm_mark(event: StoredEvent) -> AlarmMark:
+    """Mark of an alarm event; one whose text cannot be read counts all the same."""
+    try:
+        said = json.loads(event.text)["data"]["text"]
+    except (ValueError, KeyError, TypeError):
+        said = event.alarm
+    return AlarmMark(event.recorded_ns, f"{event.kind}: {said}")
+
+
+def write_kept(folder: Path, kept: dict[str, str], settings: RecordingSettings) -> None:
+    """State in the folder which files an alarm keeps; raises `RecordingError` if it cannot be written."""
+    stated = {"alarm_before_s": settings.alarm_before_s, "alarm_after_s": settings.alarm_after_s, "kept": kept}
+    path, draft = folder / KEPT, folder / (KEPT + ".new")
+    with writing(path):
+        draft.write_text(json.dumps(stated, indent=2, sort_keys=True, ensure_ascii=False) + "\n", encoding="utf-8")
+        draft.replace(path)
+
+
+def _reason(recording: Recording, marks: Sequence[AlarmMark], settings: RecordingSettings) -> str:
+    before_ns, after_ns = round(settings.alarm_before_s * _NS), round(settings.alarm_after_s * _NS)
+    begin_ns, end_ns = recording.start_ns - after_ns, recording.end_ns + before_ns
+    near = [mark for mark in marks if begin_ns <= mark.time_ns <= end_ns]
+    if not near:
+        return ""
+    first = min(near, key=lambda mark: mark.time_ns)
+    time = datetime.fromtimestamp(first.time_ns // _NS, UTC)
+    more = f" (and {len(near) - 1} more)" if len(near) > 1 else ""
+    return f"{time:%Y-%m-%d %H:%M:%S} UTC {first.text}{more}"
+
+
+def _beyond(
+    recordings: Sequence[Recording], limit_gb: float, limit_days: float, field: str, now_ns: int
+) -> list[tuple[Recording, str]]:
+    """Recordings beyond the limits, oldest first."""
+    found: list[tuple[Recording, str]] = []
+    total = 0
+    for recording in sorted(recordings, key=lambda one: (one.end_ns, one.id), reverse=True):
+        total += recording.size_bytes
+        if now_ns - recording.end_ns > limit_days * 86_400 * _NS:
+            found.append((recording, f"older than {field}_days = {limit_days:g}"))
+        elif total > limit_gb * 1e9:
+            found.append((recording, f"beyond {field}_gb = {limit_gb:g}"))
+    return found[::-1]

@@ -25,13 +25,13 @@ from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter, writing
 from service.history.age import AgeClock, running_s
 from service.history.records import StoredEvent
-from service.recordings.backlog import Backlog
-from service.recordings.catalogue import PART, SUFFIX, Catalogue, name_of
+from service.recordings.catalogue import PART, SUFFIX, AlarmMark, Catalogue, alarm_mark, decide, name_of, write_kept
 from service.recordings.leftovers import DAMAGED, leftovers, lock, loss_text, recover_leftover
-from service.recordings.retention import AlarmMark, alarm_mark, decide, write_kept
 from service.settings.service import RecordingSettings
 from service.terminal.logs import Limiter, logger
 
+_BATCH_BYTES = 1_000_000
+_MESSAGE_BYTES = 300  # memory that a message takes beyond its bytes
 _SYNC_S = 1.0
 _RETRY_S = 1.0
 _JOIN_S = 30.0
@@ -40,7 +40,7 @@ _MOST_CHANNELS = 10_000
 _ASSUMED = "application/json;assumed-from-machine-file"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RecorderStatus:
     """State of a recorder; counts are since it was started."""
 
@@ -61,6 +61,71 @@ class RecorderStatus:
     def text(self) -> str:
         """State, and what is wrong if anything is."""
         return f"{self.state}: {self.problem}" if self.problem else self.state
+
+
+class Backlog:
+    """Bounded queue between the network's thread and the recorder's; putting never waits.
+
+    When it is full, all waiting messages of the stream are thrown away at once and counted: one long gap costs the
+    evaluation less than many short ones. The few and small messages on other keys stay, unless they alone fill it.
+    """
+
+    def __init__(self, bound_bytes: int, stream: str) -> None:
+        self._bound = bound_bytes
+        self._stream = stream  # key of the sample blocks
+        self._messages: deque[RecordedMessage] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._closed = False
+        self.received = 0  # messages that arrived
+        self.dropped = 0  # messages thrown away because the disk did not keep up or could not be written
+
+    def put(self, message: RecordedMessage) -> None:
+        """Append a message; after `close` it is ignored."""
+        with self._changed:
+            if self._closed:
+                return
+            self.received += 1
+            size = _size(message)
+            if self._bytes + size > self._bound:
+                self._keep(deque(waiting for waiting in self._messages if waiting.key != self._stream))
+            if self._bytes + size > self._bound:
+                self._keep(deque())
+            if size > self._bound:
+                self.dropped += 1
+                return
+            self._messages.append(message)
+            self._bytes += size
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> list[RecordedMessage]:
+        """Take the oldest messages, about a megabyte at most; none if none arrives in time, or after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or bool(self._messages), timeout_s)
+            batch: list[RecordedMessage] = []
+            taken = 0
+            while self._messages and taken < _BATCH_BYTES:
+                message = self._messages.popleft()
+                taken += _size(message)
+                batch.append(message)
+            self._bytes -= taken
+            return batch
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether it is closed and empty."""
+        return self._closed and not self._messages
+
+    def close(self) -> None:
+        """Take no more messages; those that wait can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _keep(self, messages: deque[RecordedMessage]) -> None:
+        self.dropped += len(self._messages) - len(messages)
+        self._messages = messages
+        self._bytes = sum(map(_size, messages))
 
 
 class MachineRecorder:
@@ -96,6 +161,7 @@ class MachineRecorder:
         self._log = logger(part="recorder", machine=machine.title)
         self._limiter = Limiter(clock)
         self._backlog = Backlog(round(settings.queue_mb * 1e6), machine.keys.stream)
+        self.put = self._backlog.put  # takes a message; never waits, and never fails because of the disk
         self._catalogue = Catalogue(self.directory)
         self._pending: deque[RecordedMessage] = deque()  # taken out of the backlog, not written yet
         self._unsafe: deque[RecordedMessage] = deque()  # written, in a chunk that is not complete
@@ -107,31 +173,20 @@ class MachineRecorder:
         self._lock: int | None = None
         self._opened_s = self._synced_s = self._tidied_s = clock()
         self._safe_in_file = self._synced_in_file = 0
-        self._safe = self._synced = self._lost = self._files = self._failures = 0
-        self._problem = ""
+        self._status = RecorderStatus(machine.site, machine.name)
         self._give_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder {self.folder}", daemon=True)
+        self.start = self._thread.start
 
     def prepare(self) -> None:
-        """Make the folder and take it for this recorder; `start` does it as well, and tries again if it fails.
+        """Make the folder and take it for this recorder; its thread does it as well, and tries again if it fails.
 
-        Raises
-        ------
-        RecordingError
-            If the folder cannot be made or written, or another recorder writes there.
+        Raises `RecordingError` if the folder cannot be made or written, or another recorder writes there.
         """
         if self._lock is None:
             with writing(self.folder):
                 self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = lock(self.folder)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def put(self, message: RecordedMessage) -> None:
-        """Take a message; never waits, and never fails because of the disk."""
-        self._backlog.put(message)
 
     def stop(self) -> None:
         """Write what waits, close the file, and end the thread; what cannot be written by then is given up."""
@@ -144,21 +199,10 @@ class MachineRecorder:
 
     def status(self) -> RecorderStatus:
         """State of the recorder."""
-        name = self._file_name()
-        return RecorderStatus(
-            site=self.machine.site,
-            machine=self.machine.name,
-            state="failing" if self._problem else "recording" if self._safe or name else "idle",
-            problem=self._problem,
-            file=name,
-            received=self._backlog.received,
-            safe=self._safe,
-            synced=self._synced,
-            dropped=self._backlog.dropped,
-            lost=self._lost,
-            files=self._files,
-            failures=self._failures,
-        )
+        name, now = self._file_name(), replace(self._status)
+        now.state = "failing" if now.problem else "recording" if now.safe or name else "idle"
+        now.file, now.received, now.dropped = name, self._backlog.received, self._backlog.dropped
+        return now
 
     def _file_name(self) -> str:
         writer = self._writer
@@ -169,26 +213,29 @@ class MachineRecorder:
         while True:
             try:
                 self.prepare()
-                if not self._problem:
+                if not self._status.problem:
                     self._tidy()
                 self._record()
                 break
             except RecordingError as error:
                 self._fail(str(error))
-            except Exception as error:
-                # Nothing narrower: no error may end the recording of the machine; the message that caused it is left
-                # out.
+            except Exception as error:  # of any kind: the message that caused it is left out, the recording goes on
                 if self._limiter.admit("defect") is not None:
                     self._log.exception("error in the recorder")
-                self._give_up_message()
+                if self._writing_first:  # the message at hand
+                    message = self._pending.popleft()
+                    if self._unsafe and self._unsafe[-1] is message:
+                        self._unsafe.pop()
+                    self._status.lost += 1
+                    self._writing_first = False
                 self._fail(f"{type(error).__name__}: {error}")
             if self._give_up.wait(_RETRY_S):
                 if last:
                     break
                 last = True
-        self._lost += len(self._pending)
+        self._status.lost += len(self._pending)
         while batch := self._backlog.take(0.0):
-            self._lost += len(batch)
+            self._status.lost += len(batch)
         if self._lock is not None:
             os.close(self._lock)
 
@@ -206,7 +253,11 @@ class MachineRecorder:
             if writer is not None:
                 if now_s - self._synced_s >= _SYNC_S:
                     self._sync(writer)
-                if self._is_due(writer, now_s):
+                if (
+                    writer.size_bytes >= self.settings.rotate_mb * 1e6
+                    or now_s - self._opened_s >= self.settings.rotate_s
+                    or writer.channels >= _MOST_CHANNELS
+                ):
                     self._close(writer)
                     self._tidy()
             elif now_s - self._tidied_s >= _TIDY_S:
@@ -217,18 +268,8 @@ class MachineRecorder:
                     self._tidy()
                 return
 
-    def _is_due(self, writer: RecordingWriter, now_s: float) -> bool:
-        """Whether the file is to be closed and another one begun."""
-        return (
-            writer.size_bytes >= self.settings.rotate_mb * 1e6
-            or now_s - self._opened_s >= self.settings.rotate_s
-            or writer.channels >= _MOST_CHANNELS
-        )
-
     def _write(self, message: RecordedMessage) -> None:
-        writer = self._writer
-        if writer is None:
-            writer = self._open(message)
+        writer = self._writer or self._open(message)
         if message.key == self.machine.keys.descriptor:
             self._descriptor = message
         self._unsafe.append(message)
@@ -244,22 +285,17 @@ class MachineRecorder:
         writer = self._writer = RecordingWriter(self.folder / name_of(start_ns, number))
         self._opened_s = self._synced_s = self._clock()
         self._safe_in_file = self._synced_in_file = 0
-        if first.key != self.machine.keys.descriptor:
-            writer.write(self._head(start_ns))
+        key = self.machine.keys.descriptor
+        if first.key != key:  # the channel descriptor, logged with the file's first message
+            text = json.dumps(self.machine.descriptor.model_dump(mode="json"))
+            assumed = RecordedMessage(key, text.encode(), b"", _ASSUMED, start_ns, start_ns)
+            writer.write(replace(self._descriptor or assumed, log_time_ns=start_ns))
         return writer
-
-    def _head(self, time_ns: int) -> RecordedMessage:
-        """The channel descriptor for the head of a file, logged with the file's first message."""
-        known = self._descriptor
-        if known is not None:
-            return replace(known, log_time_ns=time_ns)
-        text = json.dumps(self.machine.descriptor.model_dump(mode="json"))
-        return RecordedMessage(self.machine.keys.descriptor, text.encode(), b"", _ASSUMED, time_ns, time_ns)
 
     def _count(self, writer: RecordingWriter) -> None:
         """Count safe messages, after anything that may have completed a chunk."""
         if writer.flushed == writer.messages and self._unsafe:
-            self._safe += len(self._unsafe)
+            self._status.safe += len(self._unsafe)
             self._safe_in_file += len(self._unsafe)
             self._unsafe.clear()
 
@@ -271,20 +307,21 @@ class MachineRecorder:
         self._count(writer)
         writer.sync()
         self._check_there(writer)
-        self._synced += self._safe_in_file - self._synced_in_file
+        now = self._status
+        now.synced += self._safe_in_file - self._synced_in_file
         self._synced_in_file = self._safe_in_file
-        if self._problem:
-            self._log.warning("recording again", file=writer.path.name, lost=self._lost, dropped=self._backlog.dropped)
-            self._problem = ""
+        if now.problem:
+            self._log.warning("recording again", file=writer.path.name, lost=now.lost, dropped=self._backlog.dropped)
+            now.problem = ""
             self._tidy()
         self._synced_s = self._clock()
 
     def _check_there(self, writer: RecordingWriter) -> None:
         """Raise if the file was deleted: the system would go on writing into it, but nobody could open it."""
         if not writer.part.exists():
-            self._lost += self._safe_in_file
-            self._safe -= self._safe_in_file
-            self._synced -= self._synced_in_file
+            self._status.lost += self._safe_in_file
+            self._status.safe -= self._safe_in_file
+            self._status.synced -= self._synced_in_file
             self._safe_in_file = self._synced_in_file = 0
             raise RecordingError(f"{writer.part}: vanished while it was being written")
 
@@ -293,13 +330,13 @@ class MachineRecorder:
         self._check_there(writer)
         writer.close()
         self._writer = None
-        self._files += 1
+        self._status.files += 1
         self._log.info("recording closed", file=writer.path.name, messages=writer.messages, bytes=writer.size_bytes)
 
     def _fail(self, problem: str) -> None:
         """Abandon the file, take back the messages that are not safe in it, and log the problem."""
-        self._failures += 1
-        self._problem = problem
+        self._status.failures += 1
+        self._status.problem = problem
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.abandon()
@@ -317,15 +354,6 @@ class MachineRecorder:
             self._lock = None
         if (withheld := self._limiter.admit("failing")) is not None:
             self._log.error("recording fails, trying again", why=problem, waiting=len(again), withheld=withheld)
-
-    def _give_up_message(self) -> None:
-        """Give up the message at hand."""
-        if self._writing_first:
-            message = self._pending.popleft()
-            if self._unsafe and self._unsafe[-1] is message:
-                self._unsafe.pop()
-            self._lost += 1
-            self._writing_first = False
 
     def _tidy(self) -> None:
         """Complete files that a crash left, and drop files beyond the limits; errors here do not stop recording."""
@@ -349,9 +377,8 @@ class MachineRecorder:
             if salvage is None:
                 self._log.warning("an incomplete recording is waiting for space on the disk", file=part.name)
             else:
-                self._log.warning(
-                    "incomplete recording recovered", file=part.name, messages=salvage.count, lost=loss_text(salvage)
-                )
+                lost = loss_text(salvage)
+                self._log.warning("incomplete recording recovered", file=part.name, messages=salvage.count, lost=lost)
 
     def _retain(self) -> None:
         recordings = self._catalogue.recordings(self.machine.site, self.machine.name)
@@ -371,3 +398,7 @@ class MachineRecorder:
         for recording, why in decision.dropped:
             recording.path.unlink(missing_ok=True)
             self._log.info("recording dropped", file=recording.path.name, why=why)
+
+
+def _size(message: RecordedMessage) -> int:
+    return len(message.payload) + len(message.attachment) + _MESSAGE_BYTES

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from models.errors import RotorwatchError
 from rotorwatch.records.replays import OfflineSummary
-from service.recordings.replay.machine import choose_machine
-from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.offline import OfflineReplay, choose_machine
 from service.recordings.replay.source import RecordingSource
 
 
@@ -31,8 +30,7 @@ def evaluated(task: MachineTask) -> tuple[OfflineSummary, str]:
     lines: list[str] = []
     installed = choose_machine(keys, task.machine, task.changes)
     run = OfflineReplay(source, keys, installed, lines.append, from_ns=task.from_ns, to_ns=task.to_ns)
-    summary = run.run()
-    return summary, "".join(line + "\n" for line in lines)
+    return run.run(), "".join(line + "\n" for line in lines)
 
 
 def on_cluster(address: str, tasks: Sequence[MachineTask]) -> Iterator[tuple[OfflineSummary, str]]:

@@ -310,9 +310,7 @@ class _Actor:
         return said
 
     def ended(self, wait_s: float) -> str:
-        if self._life is None:
-            return ""
-        if not self._ray.wait([self._life], timeout=wait_s)[0]:
+        if self._life is None or not self._ray.wait([self._life], timeout=wait_s)[0]:
             return ""
         how = "moves to another computer" if self._moves_to else "stopped"
         try:

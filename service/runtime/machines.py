@@ -26,7 +26,6 @@ from typing import Protocol
 
 from models.commissioning.commissioned import install
 from models.machine import MachineFile
-from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Health
 from service.history.store import Store
@@ -112,9 +111,7 @@ class LocalMachines:
         for worker in self.workers:
             self._record(worker, self._link, undo)
             links.append(self._connect(worker, self._link, undo))
-        supervisor = _Supervisor(list(zip(self.workers, links, strict=True)), self._listener)
-        undo.callback(supervisor.stop)
-        supervisor.start()
+        undo.callback(_Supervisor(list(zip(self.workers, links, strict=True)), self._listener).stop)
 
     def refused(self) -> str:
         """Why the history refused the latest steps of machines, which are lost; empty if it took everything."""
@@ -125,9 +122,8 @@ class LocalMachines:
         directory = self._settings.recording.directory
         if directory is None or self._settings.link.namespace:
             return lambda _: ()
-        return partial(
-            recent_messages, recorded_files(Path(directory) / machine.site / machine.name), machine.keys.stream
-        )
+        files = recorded_files(Path(directory) / machine.site / machine.name)
+        return partial(recent_messages, files, machine.keys.stream)
 
     def _record(self, worker: MachineWorker, link: Link, undo: ExitStack) -> None:
         """Record the machine if the settings say so; the recorder itself deals with disk errors."""
@@ -146,7 +142,6 @@ class LocalMachines:
         worker.recorder = recorder
 
     def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:
-        keys: MachineKeys = worker.machine.keys
         callbacks = MachineCallbacks(
             on_block=worker.inbox.put,
             on_missed=worker.missed,
@@ -157,7 +152,8 @@ class LocalMachines:
             alarm_events=worker.alarm_log,
             on_replay=worker.replay,
         )
-        machine_link = MachineLink(link, keys, callbacks, wait_when_full=self._settings.queue.when_full == "wait")
+        waits = self._settings.queue.when_full == "wait"
+        machine_link = MachineLink(link, worker.machine.keys, callbacks, wait_when_full=waits)
         undo.callback(machine_link.close)
         # The worker stops first, while its topics are still declared; closing the inbox also frees a waiting callback.
         undo.callback(worker.stop)
@@ -167,7 +163,7 @@ class LocalMachines:
 
 
 class _Supervisor:
-    """Publishes health when it has changed, silence included."""
+    """Publishes health when it has changed, silence included, from the start on."""
 
     def __init__(self, watched: list[tuple[MachineWorker, MachineLink]], listener: Listener) -> None:
         self._watched = watched
@@ -176,14 +172,11 @@ class _Supervisor:
         self._published: dict[int, Health] = {}
         self._evidence = [EvidenceCollector(worker) for worker, _ in watched]
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
-
-    def start(self) -> None:
         self._thread.start()
 
     def stop(self) -> None:
         self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        self._thread.join()
 
     def _run(self) -> None:
         while True:

@@ -1,27 +1,30 @@
-"""A machine that another process monitors, as seen by the process that serves it."""
+"""A machine that another process monitors, as seen by the one that serves it: its state as sent, and questions."""
 
+import dataclasses
+import json
 import threading
 import time
-from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
+import numpy as np
+from pydantic import BaseModel, TypeAdapter
+
+from models.checkpoint import from_bytes, to_bytes
 from models.commissioning.commissioned import install
+from models.diagnosis.window.statistics import WindowStatistics
+from models.signals.block import SampleBlock
+from models.signals.waveform import Waveform
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.machines import DetectableChanges
+from rotorwatch.records.windows import Parameter, SensorFault
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.records import StoreError
 from service.history.store import Store
-from service.monitor.alarms.operation import (
-    NotInTime,
-    OperationConflict,
-    OperationRefused,
-    OperatorAction,
-    UnknownAlarm,
-)
+from service.monitor.alarms.alarm import NotInTime, OperationConflict, OperationRefused, OperatorAction, UnknownAlarm
 from service.monitor.reports import Identity
-from service.runtime.standing import EVENTS, Question, Standing, latest_from_bytes
 from service.settings.service import MachineEntry
 from service.stream.monitored import MachineStatus, NoAnswerError, with_flow
 from service.stream.shard_link import ask
@@ -32,6 +35,33 @@ _SILENT_S = 10.0
 """Silence after which a shard is not believed any more; it sends its status every second."""
 _ERRORS = (UnknownAlarm, OperationRefused, OperationConflict, NotInTime, StoreError)
 _CALM = {HealthState.WARMING, HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
+_PARTS: dict[str, Any] = {kind.__name__: kind for kind in (LatestData, WindowStatistics, Waveform, SampleBlock)}
+_RECORDS: dict[str, type[BaseModel]] = {kind.__name__: kind for kind in (Parameter, SensorFault)}
+
+EVENTS = TypeAdapter(tuple[AlarmCloudEvent, ...])
+
+
+class Standing(BaseModel, frozen=True, arbitrary_types_allowed=True):
+    """The state of a machine; the health is None if it has not changed."""
+
+    process: str
+    place: str
+    number: int  # larger than in all earlier states of the machine from this process
+    sequence: int  # of the latest alarm event
+    status: MachineStatus
+    # Changes of these are no reason to send the whole health.
+    data_age_s: float | None
+    accepted_blocks: int
+    health: Health | None = None
+
+
+class Question(BaseModel, frozen=True):
+    """A question to the process that monitors a machine."""
+
+    about: str  # ``standing``, ``alarms``, ``detectable``, ``operate``, ``latest``
+    change: float | None = None
+    include_normal: bool = False
+    action: OperatorAction | None = None
 
 
 class RemoteMachine:
@@ -48,11 +78,8 @@ class RemoteMachine:
         self.machine = entry.load()
         self.history = store.reader(self.machine.site, self.machine.name)
         self.down = ""  # why nobody monitors it now; empty if somebody does
-        self._status = MachineStatus()
         self._taking = threading.Lock()
-        self._told_s = 0.0
-        self._data_age_s: float | None = None
-        self._accepted = 0
+        self._told_s = 0.0  # when the standing came
 
     def follow(self, process: str) -> None:
         """Believe this process from now on, and ask it for the complete state."""
@@ -68,28 +95,22 @@ class RemoteMachine:
             self.history.go_on_from(standing.sequence)
             if standing.number > self._numbers[0]:
                 self._told_s = time.monotonic()
-                self._status, self._numbers[0] = standing.status, standing.number
-                self._data_age_s, self._accepted = standing.data_age_s, standing.accepted_blocks
+                self._standing, self._numbers[0] = standing, standing.number
             if standing.health is not None and standing.number > self._numbers[1]:
                 self._health, self._numbers[1] = standing.health, standing.number
 
     @property
     def not_monitored(self) -> str:
         """Why the latest known state does not count any more; empty if it does."""
-        silent_s = time.monotonic() - self._told_s
-        return self.down or (
-            f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
-            if silent_s > _SILENT_S
-            else ""
-        )
+        if self.down or time.monotonic() - self._told_s <= _SILENT_S:
+            return self.down
+        return f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
 
     @property
     def identity(self) -> Identity:
         """The machine, and the exact files its monitor runs on."""
         told = self._health
-        return {
-            "site": told.site, "machine": told.machine, "bundle": told.bundle, "machine_hash": told.machine_hash
-        }  # fmt: skip
+        return Identity(site=told.site, machine=told.machine, bundle=told.bundle, machine_hash=told.machine_hash)
 
     @cached_property
     def snapshots(self) -> MachineSnapshots:
@@ -108,10 +129,11 @@ class RemoteMachine:
     def health(self) -> Health:
         """State of the machine now, by the latest message of its shard."""
         with self._taking:
-            health, age_s, told_s, accepted = self._health, self._data_age_s, self._told_s, self._accepted
+            health, standing, told_s = self._health, self._standing, self._told_s
+        age_s = standing.data_age_s
         if age_s is not None:
             age_s = round(age_s + time.monotonic() - told_s, 3)
-        health = with_flow(health, age_s, accepted)
+        health = with_flow(health, age_s, standing.accepted_blocks)
         if not (why := self.not_monitored):
             return health
         state = HealthState.NOT_EVALUABLE if health.state in _CALM else health.state
@@ -119,9 +141,10 @@ class RemoteMachine:
 
     def status(self) -> MachineStatus:
         """State of its monitoring."""
+        status = self._standing.status
         if not (why := self.not_monitored):
-            return self._status
-        return replace(self._status, trouble=why, alive=self._status.alive and not self.down)
+            return status
+        return dataclasses.replace(status, trouble=why, alive=status.alive and not self.down)
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
@@ -150,3 +173,47 @@ class RemoteMachine:
     def _check(self) -> None:
         if why := self.not_monitored:
             raise NoAnswerError(f"{self.history.title}: {why}")
+
+
+def latest_to_bytes(data: LatestData) -> bytes:
+    """Latest data of a monitor as bytes that hold nothing but numbers and text."""
+    arrays: list[np.ndarray] = []
+    form = json.dumps(_to_plain(data, arrays))
+    return to_bytes({"form": np.array([form])} | {str(number): array for number, array in enumerate(arrays)})
+
+
+def latest_from_bytes(content: bytes) -> LatestData:
+    """Latest data from the bytes of `latest_to_bytes`; raises `CheckpointError` if the bytes are damaged."""
+    arrays = from_bytes(content)
+    found: LatestData = _from_plain(json.loads(str(arrays["form"][0])), arrays)
+    return found
+
+
+def _to_plain(value: object, arrays: list[np.ndarray]) -> Any:
+    """The value for JSON, with its arrays moved to `arrays`; what is not plain becomes a pair of kind and content."""
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+        return ["array", str(len(arrays) - 1)]
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple):
+        return ["tuple", [_to_plain(one, arrays) for one in value]]
+    if isinstance(value, BaseModel):
+        return [type(value).__name__, value.model_dump_json()]
+    if dataclasses.is_dataclass(value):
+        fields = {one.name: _to_plain(getattr(value, one.name), arrays) for one in dataclasses.fields(value)}
+        return [type(value).__name__, fields]
+    return value
+
+
+def _from_plain(form: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if not isinstance(form, list):
+        return form
+    kind, content = form
+    if kind == "array":
+        return arrays[content]
+    if kind == "tuple":
+        return tuple(_from_plain(one, arrays) for one in content)
+    if kind in _RECORDS:
+        return _RECORDS[kind].model_validate_json(content)
+    return _PARTS[kind](**{name: _from_plain(one, arrays) for name, one in content.items()})

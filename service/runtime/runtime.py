@@ -133,14 +133,8 @@ class Runtime:
     def start(self) -> None:
         """Open the session, start the threads, serve HTTP.
 
-        Raises
-        ------
-        LinkError
-            If the Zenoh endpoints cannot be used.
-        HttpError
-            If the HTTP address cannot be listened on.
-        StoreError
-            If the history cannot be opened, or another monitor writes that of one of the machines.
+        Raises `LinkError` if the Zenoh endpoints cannot be used; `HttpError` if the HTTP address cannot be listened on;
+        `StoreError` if the history cannot be opened, or another monitor writes that of one of the machines.
         """
         with ExitStack() as undo:
             # Takes the port first: the commonest mistake, the quickest check.
@@ -234,13 +228,7 @@ def readiness_of(
 
 @contextmanager
 def running(settings: ServiceSettings, ray_address: str | None = None) -> Iterator[Runtime]:
-    """Run the service inside a ``with`` block.
-
-    Raises
-    ------
-    RotorwatchError
-        As `Runtime` and `Runtime.start`.
-    """
+    """Run the service inside a ``with`` block; raises `RotorwatchError` as `Runtime` and `Runtime.start`."""
     runtime = Runtime(settings, ray_address)
     runtime.start()
     try:

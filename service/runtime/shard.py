@@ -16,7 +16,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.health import Health
 from service.history.store import Store
 from service.runtime.machines import LocalMachines
-from service.runtime.standing import EVENTS, Question, Standing, latest_to_bytes
+from service.runtime.remote import EVENTS, Question, Standing, latest_to_bytes
 from service.settings.service import ServiceSettings
 from service.stream.shard_link import ShardLink
 from service.stream.transport import Link
@@ -57,7 +57,8 @@ def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connec
     try:
         with undo:
             while not connection.poll(_STATUS_S):
-                shard.tell_all()
+                for place in shard.workers:
+                    shard.tell(place)
     except RotorwatchError as error:
         lost = str(error)
     lost = "; ".join(filter(None, (lost, shard.refused())))
@@ -73,48 +74,42 @@ class _Shard:
     def __init__(self, settings: ServiceSettings, inner: LinkSettings, undo: ExitStack) -> None:
         self.process = uuid.uuid4().hex
         self._store = Store(settings.history.database, settings.history.retention, timeout_s=_PATIENCE_S, shared=True)
-        machines = LocalMachines(settings, self._store, self)
+        self._machines = machines = LocalMachines(settings, self._store, self)
         self.refused = machines.refused
-        self._machines = machines
         self._told: dict[str, int] = {}
         self._looking = threading.Lock()
         self._link: ShardLink | None = None
         machines.connect(undo)
         self._store.open()
         undo.callback(self._store.close)
-        self._workers = {one.history.title: one for one in machines.open(undo)}
+        self.workers = {one.history.title: one for one in machines.open(undo)}
         link = Link(inner)
         undo.callback(link.close)
-        self._link = ShardLink(link, self.process, tuple(self._workers), self._answer)
+        self._link = ShardLink(link, self.process, tuple(self.workers), self._answer)
         undo.callback(self._link.close)
         machines.start(undo)
 
     def health(self, health: Health) -> None:
-        self._tell(f"{health.site}/{health.machine}", changed=True)
+        self.tell(f"{health.site}/{health.machine}", changed=True)
 
     def wake(self) -> None:
-        for place, worker in self._workers.items():
+        for place, worker in self.workers.items():
             if worker.told - 1 != self._told.get(place):
-                self._tell(place, changed=True)
+                self.tell(place, changed=True)
 
-    def tell_all(self) -> None:
-        """Send the status of every machine."""
-        for place in self._workers:
-            self._tell(place)
-
-    def _tell(self, place: str, *, changed: bool = False) -> None:
+    def tell(self, place: str, *, changed: bool = False) -> None:
+        """Send the state of a machine, with its health if that has changed."""
         if self._link is not None:
             self._link.tell(self._standing(place, changed=changed).model_dump_json().encode())
 
     def _standing(self, place: str, *, changed: bool) -> Standing:
-        worker = self._workers[place]
+        worker = self.workers[place]
         with self._looking:  # so that a larger number means a later look
             number = time.monotonic_ns()
             sequence = worker.told - 1  # before the health, which then contains the event
             changed = changed or sequence != self._told.get(place)
             self._told[place] = sequence
-            health = worker.health()
-            status = worker.status()
+            health, status = worker.health(), worker.status()
         status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
         return Standing(
             process=self.process,
@@ -136,4 +131,4 @@ class _Shard:
             "operate": lambda one: EVENTS.dump_json(() if question.action is None else one.operate(question.action)),
             "latest": lambda one: latest_to_bytes(one.latest),
         }
-        return answers[question.about](self._workers[place])
+        return answers[question.about](self.workers[place])

@@ -16,8 +16,7 @@ from service.history.records import StoreError
 from service.history.store import Store
 from service.runtime.machines import Listener
 from service.runtime.processes import Placement, ShardProcess
-from service.runtime.remote import RemoteMachine
-from service.runtime.standing import Standing
+from service.runtime.remote import RemoteMachine, Standing
 from service.settings.service import MachineEntry, ServiceSettings
 from service.stream.shard_link import hear
 from service.stream.transport import LinkError

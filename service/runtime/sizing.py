@@ -17,7 +17,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -95,15 +95,13 @@ class Costs(BaseModel, extra="forbid", frozen=True):
 
     @cached_property
     def _of_terms(self) -> dict[Measured, FloatArray]:
-        return {what: self._fitted(what) for what in _ALL}
-
-    def _fitted(self, what: Measured) -> FloatArray:
-        measured = np.array([getattr(case, what) for case in self.cases])
-        scale = np.maximum(measured, 1e-3 * max(measured.max(), 1e-9))
-        of_terms: FloatArray = nnls(
-            np.array([case.terms(what) for case in self.cases]) / scale[:, None], measured / scale
-        )[0]
-        return of_terms
+        found: dict[Measured, FloatArray] = {}
+        for what in get_args(Measured):
+            measured = np.array([getattr(case, what) for case in self.cases])
+            scale = np.maximum(measured, 1e-3 * max(measured.max(), 1e-9))
+            terms = np.array([case.terms(what) for case in self.cases])
+            found[what] = nnls(terms / scale[:, None], measured / scale)[0]
+        return found
 
     def of(self, kind: Kind, what: Measured) -> float:
         """Cost of a kind of machine by the model."""
@@ -113,8 +111,7 @@ class Costs(BaseModel, extra="forbid", frozen=True):
     def deviation(self, what: Measured) -> float:
         """Largest relative difference between the model and what was measured."""
         measured: list[float] = [getattr(case, what) for case in self.cases]
-        ratios = [self.of(case, what) / one for case, one in zip(self.cases, measured, strict=True) if one]
-        return max(abs(ratio - 1) for ratio in ratios)
+        return max(abs(self.of(case, what) / one - 1) for case, one in zip(self.cases, measured, strict=True) if one)
 
     def outside(self, kind: Kind) -> list[str]:
         """In which respects a kind lies outside those that were measured, in words; empty if in none."""
@@ -126,9 +123,6 @@ class Costs(BaseModel, extra="forbid", frozen=True):
                 what = name.partition("_")[0]
                 told.append(f"{what} {value:g}{unit}, measured {min(found):g} to {max(found):g}{unit}")
         return told or ([] if like else ["no machine that is diagnosed like that was measured"])
-
-
-_ALL: tuple[Measured, ...] = ("processor_ms", "memory_mb", "written_kb", "reports_kb", "readings_kb", "told_kb")
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,13 +79,7 @@ class MachineEntry(BaseModel, extra="forbid", frozen=True):
     )
 
     def load(self) -> MachineFile:
-        """Load the machine file.
-
-        Raises
-        ------
-        MachineFileError
-            Naming the file, the field and the value found.
-        """
+        """Load the machine file; raises `MachineFileError`, naming the file, the field and the value found."""
         return load_machine_file(self.file)
 
 
@@ -319,10 +313,9 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         raise MachineFileError("\n".join(told))
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
-    history = settings.history
+    history, recording = settings.history, settings.recording
     if history.url is not None:
         history = history.model_copy(update={"url": _beside(folder, history.url)})
-    recording = settings.recording
     if recording.directory is not None:
         directory = folder / recording.directory
         if directory.exists() and not directory.is_dir():

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from typing import Any, Self
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -92,10 +92,6 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
             raise ValueError("ca_file is for https, and url is http")
 
     @property
-    def _parts(self) -> SplitResult:
-        return urlsplit(self.url)
-
-    @property
     def target(self) -> str:
         """The address without path and query, which may hold a secret.
 
@@ -105,9 +101,10 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
         >>> hook.target
         'https://hooks.example'
         """
-        return f"{self._parts.scheme}://{self._parts.netloc}"
+        parts = urlsplit(self.url)
+        return f"{parts.scheme}://{parts.netloc}"
 
     @property
     def on_this_computer(self) -> bool:
         """Whether the receiver runs on this computer."""
-        return is_loopback(self._parts.hostname or "")
+        return is_loopback(urlsplit(self.url).hostname or "")

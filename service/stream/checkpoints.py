@@ -1,6 +1,7 @@
 """What a monitor writes into the history with every hop, and how it is restored from there."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 from models.errors import CheckpointError
@@ -19,9 +20,9 @@ from service.history.records import (
     StoredReport,
     StoreError,
 )
-from service.monitor.alarm_conversion import alarm_cloud_event, rfc3339
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
+from service.monitor.conversion import alarm_cloud_event, rfc3339
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
@@ -45,9 +46,9 @@ def stored_readings(windows: Iterable[Report]) -> tuple[StoredReading, ...]:
         points += [("parameter", one.name, one.relative_change, one.standard_error) for one in window.parameters]
         points += [("equation", one.equation, one.msd, None) for one in window.equations]
         points += [
-            ("level", f"{one.channel}:{name}", value, None)
-            for one in window.levels
-            for name, value in one.values().items()
+            ("level", f"{level.channel}:{name}", value, None)
+            for level in window.levels
+            for name, value in level.values().items()
         ]
         found += [
             StoredReading(window.end_ns, quantity, name, value, finite(error))
@@ -85,23 +86,15 @@ class StepWriter:
     def __init__(self, history: MachineStore, identity: Identity) -> None:
         self._history = history
         self._identity = identity
-        self._owed: tuple[AlarmEvent, ...] = ()
-        self._kept: tuple[str, ...] = ()
+        self.owed: tuple[AlarmEvent, ...] = ()  # events that go into the next step
+        self.kept: tuple[str, ...] = ()  # parts of the state that are in the history already
         self._generation = 0
         # Why the latest step is not in the history as a whole; None if it is, or waits to be.
         self.refused: Exception | None = None
 
-    def keeps(self, parts: tuple[str, ...]) -> None:
-        """Take note of the parts of the state that are in the history already."""
-        self._kept = parts
-
     def begun_anew(self) -> str:
         """Why everything has to be written to the history again; empty if it need not be."""
         return "" if self._generation == self._history.generation else self._history.news
-
-    def owe(self, events: tuple[AlarmEvent, ...]) -> None:
-        """Take note of events that go into the next step."""
-        self._owed += events
 
     def commit(
         self, monitor: MachineMonitor, windows: tuple[Report, ...], recorded_ns: int, *, whole: bool = False
@@ -113,19 +106,23 @@ class StepWriter:
         """
         self.refused = None
         if (generation := self._history.generation) != self._generation:
-            self._kept, self._generation = (), generation
+            self.kept, self._generation = (), generation
         reports: tuple[StoredReport, ...] = ()
-        told = tuple(self._to_publish(event, recorded_ns) for event in self._owed)
+        told = tuple(self._to_publish(event, recorded_ns) for event in self.owed)
         try:
             reports = tuple(stored_report(window) for window in windows)
-            state = monitor.state(self._kept, whole=whole)
+            state = monitor.state(self.kept, whole=whole)
             checkpoint = checkpoint_step(self._identity, state, recorded_ns)
             written = self._history.commit(Step(reports, stored_readings(windows), told, checkpoint))
         except Exception as error:  # whatever it is, no alarm may be lost to it
-            self.refused, self._kept = error, ()
-            self._commit_events(told)
+            self.refused, self.kept = error, ()
+            # The events alone; a restart then continues from an older state, with the log's own numbers.
+            with suppress(StoreError):  # said already
+                if told:
+                    self._history.commit(Step(events=told))
+                self.owed = ()
             return reports, told, False
-        self._kept, self._owed = state.parts, ()
+        self.kept, self.owed = state.parts, ()
         return reports, told, written
 
     def _to_publish(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
@@ -137,15 +134,6 @@ class StepWriter:
             was = event.alarm
             bare = Alarm(was.name, was.state, was.present, was.severity, was.since_ns, was.raised_ns, was.occurrence)
             return stored_event(self._identity, replace(event, alarm=bare), recorded_ns)
-
-    def _commit_events(self, told: tuple[StoredEvent, ...]) -> None:
-        """Commit the events alone; a restart then continues from an older state, with the log's own numbers."""
-        try:
-            if told:
-                self._history.commit(Step(events=told))
-        except StoreError:
-            return  # said already
-        self._owed = ()
 
 
 def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:
@@ -173,7 +161,13 @@ def restored(
     """
     head, monitor = checkpoint.head, build()
     at = rfc3339(head.end_ns) if head.end_ns else "the beginning, before any data"
-    differs = _differences(head, identity)
+    pairs = {
+        "form of what is remembered": (head.format, FORMAT),
+        "machine file": (head.machine_hash, identity["machine_hash"]),
+        "bundle": (head.bundle, identity["bundle"]),
+        "program version": (head.code_version, __version__),
+    }
+    differs = [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]
     if not differs:
         try:
             monitor.restore(head.state, tuple(data for _, data in checkpoint.parts))
@@ -207,13 +201,3 @@ def recorded_after(monitor: MachineMonitor, recorded: Iterable[RecordedMessage])
             yield message
         else:
             newest = monitor.recall(message.payload, message.attachment, message.encoding)
-
-
-def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:
-    pairs = {
-        "form of what is remembered": (head.format, FORMAT),
-        "machine file": (head.machine_hash, identity["machine_hash"]),
-        "bundle": (head.bundle, identity["bundle"]),
-        "program version": (head.code_version, __version__),
-    }
-    return [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]

@@ -11,7 +11,7 @@ from rotorwatch.records.machines import DetectableChanges
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
-from service.monitor.alarms.operation import OperatorAction
+from service.monitor.alarms.alarm import OperatorAction
 from service.monitor.reports import Identity, Tally
 from service.recordings.recorder import RecorderStatus
 

@@ -7,7 +7,7 @@ replay is refused as long as a publisher or a monitor of the machine is alive, a
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,8 +20,7 @@ from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
 from rotorwatch.records.replays import ReplayProgress
-from service.recordings.replay.control import Control
-from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.player import Control, PlayPlan, play
 from service.recordings.replay.source import RecordingSource
 from service.stream.transport import Link, answering
 
@@ -69,7 +68,7 @@ class LiveMachineError(RotorwatchError):
 
 
 class ReplayLink:
-    """A Zenoh session that publishes one pass of a replay after the other; a context manager.
+    """A Zenoh session that publishes one pass of a replay after the other.
 
     Parameters
     ----------
@@ -94,10 +93,8 @@ class ReplayLink:
         self._live = ""
         self._undo = ExitStack()
 
-    def __enter__(self) -> "ReplayLink":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Undeclare all of the pass, and close the session."""
         self.end_pass()
         self._link.close()
 
@@ -179,8 +176,7 @@ class ReplayLink:
         return f"{self._prefix}/{key}" if self._prefix else key
 
     def _publisher(self, key: str) -> _Publisher:
-        known = self._publishers.get(key)
-        if known is not None:
+        if (known := self._publishers.get(key)) is not None:
             return known
         session = self._link.session
         congestion = zenoh.CongestionControl.BLOCK if self._wait else zenoh.CongestionControl.DROP
@@ -236,17 +232,11 @@ def replay_to_network(
 ) -> int:
     """Publish recordings until the end of the last pass, or until `control` says stop.
 
-    Raises
-    ------
-    LinkError
-        If there is no session.
-    LiveMachineError
-        If a live publisher or monitor is, or appears, on the original keys.
-    RecordingError
-        Where a recording is damaged.
+    Raises `LinkError` if there is no session; `LiveMachineError` if a live publisher or monitor is, or appears, on the
+    original keys; `RecordingError` where a recording is damaged.
     """
     count, number = 0, 0
-    with ReplayLink(plan.link, control.stop) as link:
+    with closing(ReplayLink(plan.link, control.stop)) as link:
         while not control.stopped and (plan.passes is None or number < plan.passes):
             number += 1
             described = {keys: source.descriptor(keys, plan.from_ns) for keys in plan.machines}

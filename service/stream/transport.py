@@ -29,8 +29,7 @@ from models.signals.keys import PREFIX, MachineKeys, Topic
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
-from service.stream.inbox import RawBlock
-from service.stream.intake import Intake
+from service.stream.inbox import Intake, RawBlock
 from service.stream.log_query import read_log_query
 from service.stream.subscription import BlockSubscription
 from service.terminal.logs import logger
@@ -220,10 +219,11 @@ class MachineLink:
         self._callbacks.on_replay(sample.kind == zenoh.SampleKind.PUT)
 
     def _take_block(self, sample: zenoh.Sample) -> None:
-        encoding = str(sample.encoding)
+        encoding, info = str(sample.encoding), sample.source_info
         if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, _source(sample)))
+            source = "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
+            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, source))
 
     def _take_miss(self, miss: zenoh.ext.Miss) -> None:
         self._callbacks.on_missed(miss.nb)
@@ -292,13 +292,13 @@ def follow(
         If nobody answers at the endpoints.
     """
     site, _, machine = machines.partition("/")
-    suffixes = {name: getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/") for name in topics}
 
     def take(sample: zenoh.Sample) -> None:
         callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
 
     with closing(Link(settings, fail_fast=True)) as link, ExitStack() as undo:
-        for name, suffix in suffixes.items():
+        for name in topics:
+            suffix = getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/")
             current = name in {"health", "alarm_state"}
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 link.session,
@@ -325,13 +325,7 @@ def relay_items(*, waits: bool) -> dict[str, str]:
 
 @contextmanager
 def route(settings: LinkSettings) -> Iterator[None]:
-    """Run a Zenoh router, whatever the role in the settings.
-
-    Raises
-    ------
-    LinkError
-        If it cannot listen.
-    """
+    """Run a Zenoh router, whatever the role in the settings; raises `LinkError` if it cannot listen."""
     with closing(Link(settings.model_copy(update={"mode": "router"}), more=relay_items(waits=True))):
         yield
 
@@ -346,18 +340,10 @@ def _ask(link: Link, key: str, callback: Callable[[zenoh.Sample], None]) -> None
     link.session.get(key, link.guarded(take), timeout=_QUERY_TIMEOUT_S)
 
 
-def _source(sample: zenoh.Sample) -> str:
-    """The publisher's session and its number there; empty if its messages are not numbered."""
-    info = sample.source_info
-    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
-
-
 def _verbatim(sample: zenoh.Sample) -> RecordedMessage:
     """A sample with the time at which it arrived, and that of its publication if it carries one."""
-    log_time_ns = time.time_ns()
-    publish_time_ns = log_time_ns
-    if sample.timestamp is not None:
-        publish_time_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
+    log_time_ns, stamp = time.time_ns(), sample.timestamp
+    publish_time_ns = log_time_ns if stamp is None else stamp.get_time_as_ntp64().as_nanos()
     attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
     return RecordedMessage(
         str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding), log_time_ns, publish_time_ns
@@ -401,9 +387,6 @@ def _answering_from_log(key: str, answer: Callable[[int, int], str]) -> Callable
 
 def _explain(settings: LinkSettings, error: str) -> str:
     """Say which endpoints, and Zenoh's reason without the places in its source code."""
-    ends = [
-        f"{what} {', '.join(where)}"
-        for what, where in (("listen", settings.listen), ("connect", settings.connect))
-        if where
-    ]
+    named = {"listen": settings.listen, "connect": settings.connect}
+    ends = [f"{what} {', '.join(where)}" for what, where in named.items() if where]
     return f"Zenoh session ({settings.mode}, {'; '.join(ends)}) could not be opened: {settings.explain(error)}"

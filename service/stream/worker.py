@@ -24,19 +24,17 @@ from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion
-from service.monitor.alarm_conversion import alarm_cloud_event, alarm_log_page, alarm_states
-from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.alarm import AlarmEvent, NotInTime, OperatorAction
 from service.monitor.alarms.book import NO_ALARMS
-from service.monitor.alarms.operation import NotInTime, OperatorAction
+from service.monitor.conversion import alarm_cloud_event, alarm_entries, alarm_log_page
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
-from service.stream.data_clock import DataClock
 from service.stream.inbox import Inbox, RawBlock
-from service.stream.liveness import COMPUTER, Clocks, Pulse
+from service.stream.liveness import COMPUTER, Clocks, DataClock, Pulse
 from service.stream.monitored import MachineStatus
 from service.stream.shedding import LoadShedding, in_turn
 from service.terminal.logs import Limiter, logger
@@ -114,19 +112,18 @@ class MachineWorker:
         self._outlet: Callable[[Topic, str], None] | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._pulse = Pulse(self.inbox.call, self._tick)
+        self.tick = self._pulse.beat  # lets the thread notice that time passes; to be called every now and then
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
         """A monitor that continues from the history if there is a checkpoint, and what was restored, in a sentence."""
-        last = self.history.last_sequence()
-        checkpoint = self.history.restore()
+        last, checkpoint = self.history.last_sequence(), self.history.restore()
         if checkpoint is None:
             monitor = MachineMonitor(installed, self._skips)
-            if last >= 0:
-                monitor.restore_alarms(NO_ALARMS, last + 1)
+            monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed, self._skips), self.identity, checkpoint, last + 1)
-        self.steps.keeps(tuple(name for name, _ in checkpoint.parts))
+        self.steps.kept = tuple(name for name, _ in checkpoint.parts)
         self.history.go_on_from(monitor.next_sequence - 1)
         self._time.slept(checkpoint.head.recorded_ns)
         # They were committed but perhaps not published; subscribers leave out those that they had by their id.
@@ -229,7 +226,8 @@ class MachineWorker:
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
         snapshot = self._snapshot
-        return alarm_states(self.identity, snapshot.alarms, snapshot.sequence, include_normal=include_normal)
+        alarms = alarm_entries(snapshot.alarms, include_normal=include_normal)
+        return AlarmStates(**self.identity, alarms=alarms, sequence=snapshot.sequence)
 
     def alarm_log(self, after: int, limit: int) -> str:
         """Alarm events after a sequence number, -1 for the beginning, as JSON of an `AlarmLogPage`; from any thread.
@@ -250,12 +248,7 @@ class MachineWorker:
     def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, on the machine's thread, and say what happened.
 
-        Raises
-        ------
-        UnknownAlarm, OperationConflict, OperationRefused
-            As `AlarmBook.operate`.
-        NotInTime
-            If the thread does not answer.
+        Raises as `AlarmBook.operate`, and `NotInTime` if the thread does not answer.
         """
         done: Future[tuple[AlarmCloudEvent, ...]] = Future()
 
@@ -274,15 +267,8 @@ class MachineWorker:
         try:
             return done.result(_OPERATION_S)
         except TimeoutError as error:
-            if done.cancel():
-                raise NotInTime(f"{self.machine.title}: busy for {_OPERATION_S:g} s; nothing was done") from error
-            raise NotInTime(
-                f"{self.machine.title}: busy for {_OPERATION_S:g} s; look at the alarm before trying again"
-            ) from error
-
-    def tick(self) -> None:
-        """Let the machine's thread notice that time passes, with data or without; called every now and then."""
-        self._pulse.beat()
+            then = "nothing was done" if done.cancel() else "look at the alarm before trying again"
+            raise NotInTime(f"{self.machine.title}: busy for {_OPERATION_S:g} s; {then}") from error
 
     def _data_now_ns(self) -> int:
         return self._time.now_ns(self._monitor.end_ns)
@@ -304,18 +290,15 @@ class MachineWorker:
         shedding, to_hop = self._shedding, self._monitor.blocks_to_hop
         return shedding is not None and shedding.skips(self.inbox.behind, to_hop, self._clocks.monotonic_s())
 
-    def _catch_up(self, since_ns: int) -> None:
-        """Refill the window from the recording, and take what was recorded after the latest committed step."""
-        for message in recorded_after(self._monitor, self._recorded(since_ns)):
-            self._take(RawBlock(message.payload, message.attachment, message.encoding))
-            self._time.slept(message.log_time_ns)
-        self._snapshot = self._monitor.health()
-        self._time.wake()
-
     def _run(self) -> None:
         try:
             if self._recorded_since_ns is not None:
-                self._catch_up(self._recorded_since_ns)
+                # Refill the window from the recording, and take what was recorded after the latest committed step.
+                for message in recorded_after(self._monitor, self._recorded(self._recorded_since_ns)):
+                    self._take(RawBlock(message.payload, message.attachment, message.encoding))
+                    self._time.slept(message.log_time_ns)
+                self._snapshot = self._monitor.health()
+                self._time.wake()
         except Exception as error:  # a defect that it brings to light must not end the monitoring of the machine
             self._note_error(error)
         self._monitor.begin()
@@ -382,13 +365,10 @@ class MachineWorker:
         if not news and len(self.inbox) and now_s - self._seen_s < _LONGEST_UNSEEN_S:
             return
         self._seen_s = now_s
-        self.steps.owe(events)
+        self.steps.owed += events
         snapshot = self._monitor.health()
-        reports: tuple[StoredReport, ...] = ()
-        told: tuple[StoredEvent, ...] = ()
         try:
-            if news:
-                reports, told = self._commit(windows, whole=whole)
+            reports, told = self._commit(windows, whole=whole) if news else ((), ())
         finally:
             self._snapshot = snapshot
             self._make_latest = partial(held_now, self._monitor.window, snapshot, self._monitor.blocks)
@@ -434,8 +414,7 @@ class MachineWorker:
             outlet("alarm_event", text)
         # Changes of parameters are in every report; alarm states are published only if a state or a delay has changed.
         now = tuple(
-            (alarm.name, alarm.version, alarm.beyond_ns is None, alarm.small_ns is None)
-            for alarm in self._snapshot.alarms
+            (one.name, one.version, one.beyond_ns is None, one.small_ns is None) for one in self._snapshot.alarms
         )
         if now != self._published_alarms:
             self._published_alarms = now

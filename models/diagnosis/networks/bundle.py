@@ -40,7 +40,7 @@ from models.machine import Machine
 from models.mistakes import did_you_mean, mistakes
 
 MANIFEST = "manifest.json"
-_SHIPPED = Path(__file__).parents[2] / "bundles"
+SHIPPED_BUNDLES = Path(__file__).parents[2] / "bundles"
 _Array = np.ndarray[Any, np.dtype[Any]]
 _Arrays = dict[str, _Array]
 _FORMAT = 2
@@ -206,15 +206,15 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
         Naming what is missing, damaged, or different, with both values.
     """
     directory = Path(name_or_path)
-    if not directory.is_dir() and (_SHIPPED / str(name_or_path)).is_dir():
-        directory = _SHIPPED / str(name_or_path)
+    if not directory.is_dir() and (SHIPPED_BUNDLES / str(name_or_path)).is_dir():
+        directory = SHIPPED_BUNDLES / str(name_or_path)
     try:
         manifest = Manifest.model_validate_json((directory / MANIFEST).read_bytes())
         weights = (directory / "weights.safetensors").read_bytes()
     except OSError as error:
         if directory.is_dir() and not isinstance(error, FileNotFoundError):
             raise BundleError(f"{error.filename}: cannot be read ({error.strerror})") from error
-        shipped = sorted(entry.name for entry in _SHIPPED.iterdir() if entry.is_dir())
+        shipped = sorted(entry.name for entry in SHIPPED_BUNDLES.iterdir() if entry.is_dir())
         why = f"no {Path(error.filename).name} in it" if directory.is_dir() else "there is no such folder"
         raise BundleError(
             f"{directory}: not a bundle, {why}; shipped bundles: {', '.join(shipped)}"

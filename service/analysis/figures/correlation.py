@@ -12,7 +12,7 @@ from models.errors import MachineFileError
 from service.analysis.correlation import Panel, correlations_of, latest_window
 from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm
 from service.analysis.recorded import Recorded
-from service.recordings.replay.machine import choose_machine
+from service.recordings.replay.offline import choose_machine
 
 
 def correlation(data: Recorded, choice: str | None) -> Paint:

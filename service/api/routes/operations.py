@@ -23,15 +23,9 @@ from service.access.guard import Guard
 from service.access.problems import responses
 from service.access.scopes import Caller
 from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, check_alarm, found_machine
-from service.monitor.alarm_conversion import alarm_entries
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
-from service.monitor.alarms.operation import (
-    NotInTime,
-    OperationConflict,
-    OperationRefused,
-    OperatorAction,
-    UnknownAlarm,
-)
+from service.monitor.alarms.alarm import NotInTime, OperationConflict, OperationRefused, OperatorAction, UnknownAlarm
+from service.monitor.conversion import alarm_entries
 from service.stream.monitored import Monitored
 
 _IF_MATCH = form(r'^(\*|(W/)?"-?[0-9]{1,18}")$', 'an ETag such as "17", or *')

@@ -17,8 +17,7 @@ from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from service.access.guard import Guard
 from service.access.problems import problem_answer, problem_responses, responses
 from service.recordings.catalogue import Catalogue, Recording
-from service.recordings.replay.data_time import DataSpan
-from service.recordings.replay.source import RecordingSource
+from service.recordings.replay.source import DataSpan, RecordingSource
 
 _PLACE = "/api/v1/recordings"
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}

@@ -39,7 +39,7 @@ from service.access.problems import problem_responses, responses
 from service.api.routes.recordings import found_recording
 from service.recordings.catalogue import Catalogue
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, RunningJob, TooManyReplaysError
-from service.recordings.replay.machine import check_sent, choose_machine, is_shipped_bundle, is_shipped_machine
+from service.recordings.replay.offline import check_sent, choose_machine, is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
 _PLACE = "/api/v1/replays"

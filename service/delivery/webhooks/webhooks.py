@@ -12,7 +12,7 @@ from service.delivery.webhooks.dispatcher import Dispatcher
 from service.delivery.webhooks.receiver import Receiver
 from service.history.machine import MachineStore
 from service.history.shared import WebhookCursors
-from service.monitor.alarm_conversion import rfc3339
+from service.monitor.conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 
 

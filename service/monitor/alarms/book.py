@@ -2,7 +2,7 @@
 
 A reading calls for an alarm's condition to begin (*beyond* its limit) or to end (*small* again). In the deadband
 between the two limits, and where nothing was read, it calls for neither: missing data neither raise nor clear. What is
-called for throughout the on-delay or off-delay, in data time, happens; `service.monitor.alarms.life_cycle` gives the
+called for throughout the on-delay or off-delay, in data time, happens; `service.monitor.alarms.alarm.TABLE` gives the
 alarm's next state.
 
 A parameter is beyond its limit if the sequential test names it as changed, almost certainly, by more than that limit.
@@ -22,15 +22,17 @@ from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
-from rotorwatch.records.windows import Candidate, Verdict
-from service.monitor.alarms.alarm import Alarm, AlarmEvent
-from service.monitor.alarms.life_cycle import follow, owed_after
-from service.monitor.alarms.operation import (
+from rotorwatch.records.windows import Verdict
+from service.monitor.alarms.alarm import (
     KIND_OF_EVENT,
+    Alarm,
+    AlarmEvent,
     OperationConflict,
     OperationRefused,
     OperatorAction,
     UnknownAlarm,
+    follow,
+    owed_after,
 )
 
 _LEAST_KEPT_PROBABILITY = 0.5
@@ -117,10 +119,10 @@ class AlarmBook:
             Whether the suspect hides what parameters do: none is named then, and none that was named is taken back. If
             a parameter explains the data as well, so that they are not outside the model, both are candidates.
         """
-        named = [finding.name for finding in verdict.changed]
+        named, outside = [finding.name for finding in verdict.changed], verdict.outside_model
         unreserved = set(named)
         probability = {one.name: one.probability for one in verdict.candidates}
-        another = verdict.outside_model and len(named) >= _LEAST_CHANGES_UNNAMED
+        another = outside and len(named) >= _LEAST_CHANGES_UNNAMED
         nameless = another or hidden
         sure = {one for one in named if not nameless and probability.get(one, 0.0) >= self._settings.name_confidence}
         held = {*named, *(one for one, likely in probability.items() if likely >= _LEAST_KEPT_PROBABILITY)}
@@ -152,7 +154,7 @@ class AlarmBook:
                     end_ns,
                     named=reading.name in sure,
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
-                    low_confidence=verdict.outside_model
+                    low_confidence=outside
                     or hidden
                     or held_stiff
                     or (unlike and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
@@ -160,14 +162,14 @@ class AlarmBook:
                     evidence=evidence,
                     note=_HELD_STIFF_NOTE if held_stiff else "" if reading.vector is None else reading.vector.text,
                 )
-        if verdict.outside_model and not verdict.current:
+        if outside and not verdict.current:
             # Nothing is read from unexplained data, and parameters named before are named with reserve from now on.
             self._alarms |= {
                 name: replace(self._alarms[name], low_confidence=True) for name in PARAMETERS if self.present(name)
             }
         if verdict.current:
             # Outside the model no candidate need be right, which alarm `model` says; and one cause has one alarm.
-            told = verdict.outside_model or any(self.present(name) for name in probability)
+            told = outside or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
             rival = [suspect] if hidden and suspect else []  # stated however little the parameter would have changed
             changes = [
@@ -175,23 +177,26 @@ class AlarmBook:
                 for one in verdict.current
                 if one.name in unsure
             ]
+            # With their probabilities if parameters are the only candidates.
+            candidates = [
+                f"{one.text} ({one.name})" + ("" if rival else f" {one.probability:.0%}") for one in verdict.candidates
+            ]
             self.update_state(
                 CHANGED,
                 any(change > limits.raise_above or rival for change, limits in changes),
                 end_ns,
-                " or ".join([*(_candidate(one, alone=not rival) for one in verdict.candidates), *rival]),
+                " or ".join(candidates + rival),
                 evidence=evidence,
                 danger=any(change > limits.danger_above and not rival for change, limits in changes),
             )
-        if verdict.current or unexplained or verdict.outside_model:
+        if verdict.current or unexplained or outside:
             at_once = f"{', '.join(named)} seem to have changed at the same time, so none is named" if another else ""
             within_s = astride_s + self._settings.on_delay_s
             just = f"if a parameter has just changed, it can be named in {within_s:.0f} s" if astride_s else ""
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
-            outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
         heard = any(self._alarms[one].due for one in (*probability, CHANGED) if one in self._alarms)
-        return bool(unreserved) and heard and not (verdict.outside_model or hidden)
+        return bool(unreserved) and heard and not (outside or hidden)
 
     def update(  # noqa: PLR0913  # what one reading says
         self,
@@ -298,47 +303,37 @@ class AlarmBook:
     def clock_stepped(self, time_ns: int, step_ns: int) -> None:
         """Restart all running delays and keep the remaining shelving times: the data's clock was set."""
         for name, alarm in self._alarms.items():
-            shelf = alarm.shelf
-            self._alarms[name] = replace(
-                alarm,
-                beyond_ns=None if alarm.beyond_ns is None else time_ns,
-                small_ns=None if alarm.small_ns is None else time_ns,
-                shelf=None if shelf is None else shelf.model_copy(update={"until_ns": shelf.until_ns + step_ns}),
-            )
+            shelf = alarm.shelf and alarm.shelf.model_copy(update={"until_ns": alarm.shelf.until_ns + step_ns})
+            beyond_ns = None if alarm.beyond_ns is None else time_ns
+            small_ns = None if alarm.small_ns is None else time_ns
+            self._alarms[name] = replace(alarm, beyond_ns=beyond_ns, small_ns=small_ns, shelf=shelf)
 
     def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for, at the data time that has been reached.
 
-        Raises
-        ------
-        UnknownAlarm
-            If there is no such alarm.
-        OperationConflict
-            If the alarm is no longer as the operator saw it.
-        OperationRefused
-            If it is in a state in which this cannot be done, a reason is missing, or the time is too long.
+        Raises `UnknownAlarm`, `OperationConflict`, and `OperationRefused` also if a reason is missing or the time is
+        too long.
         """
         if not is_alarm(operation.alarm):
             raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
         alarm = self._alarm_named(operation.alarm, time_ns)
         self._must_be_as_seen(alarm, operation)
         kind = KIND_OF_EVENT[operation.kind]
-        if follow(alarm.state, kind, present=alarm.present, latching=self._latches(alarm)) is None:
+        if follow(alarm.state, kind, present=alarm.present, latching=alarm.name in self._settings.latching) is None:
             hint = " (acknowledge needs an alarm that has been raised)" if kind is EventKind.ACKNOWLEDGED else ""
             raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible{hint}")
         if kind in {EventKind.SHELVED, EventKind.REMOVED_FROM_SERVICE} and not operation.reason.strip():
             raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected an explanation")
+        actor, reason = operation.actor, operation.reason
         if kind is EventKind.SHELVED:
             alarm = replace(alarm, shelf=self._shelf(operation, time_ns))
         elif kind is EventKind.UNSHELVED:
-            return self._unshelve(alarm, time_ns, operation.reason, operation.actor)
+            return self._unshelve(alarm, time_ns, reason, actor)
         elif kind is EventKind.REMOVED_FROM_SERVICE:
-            alarm = replace(
-                alarm, shelf=None, out_of_service_by=operation.actor, out_of_service_reason=operation.reason
-            )
+            alarm = replace(alarm, shelf=None, out_of_service_by=actor, out_of_service_reason=reason)
         elif kind is EventKind.RETURNED_TO_SERVICE:
             alarm = replace(alarm, out_of_service_by="", out_of_service_reason="")
-        events = self._transition(alarm, kind, time_ns, actor=operation.actor, reason=operation.reason)
+        events = self._transition(alarm, kind, time_ns, actor=actor, reason=reason)
         return events + self._suppressed_again(alarm.name, time_ns)
 
     # Surviving a restart
@@ -371,9 +366,6 @@ class AlarmBook:
 
     def _alarm_named(self, name: str, time_ns: int) -> Alarm:
         return self._alarms.get(name) or Alarm(name, since_ns=time_ns)
-
-    def _latches(self, alarm: Alarm) -> bool:
-        return alarm.name in self._settings.latching
 
     def _applies(self, rule: SuppressRule, alarm: Alarm, speed_rpm: float | None) -> bool:
         if rule.while_alarm is not None:
@@ -451,7 +443,7 @@ class AlarmBook:
         self, alarm: Alarm, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
     ) -> tuple[AlarmEvent, ...]:
         """Move the alarm through its life cycle and record the event."""
-        before, latching = alarm.state, self._latches(alarm)
+        before, latching = alarm.state, alarm.name in self._settings.latching
         state = follow(before, kind, present=alarm.present, latching=latching, owed=alarm.owed)
         if state is None:
             raise OperationRefused(f"{alarm.name} is {before.value}: it cannot be {kind.value}")
@@ -468,8 +460,3 @@ class AlarmBook:
         self._alarms[alarm.name] = alarm
         self._pending_events.append(event)
         return (event,)
-
-
-def _candidate(one: Candidate, *, alone: bool) -> str:
-    """A candidate; with its probability if parameters are the only candidates (`alone`)."""
-    return f"{one.text} ({one.name}) {one.probability:.0%}" if alone else f"{one.text} ({one.name})"

@@ -34,10 +34,9 @@ class DataPathAlarms:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """The complete state as named arrays."""
-        whole_ns = [] if self._whole_ns is None else [self._whole_ns]
         unseen = [self._unseen_windows, self._unseen_blocks, self._unseen_s]
         return {
-            "whole_ns": np.array(whole_ns, dtype=np.int64),
+            "whole_ns": np.array([] if self._whole_ns is None else [self._whole_ns], dtype=np.int64),
             "unseen": np.array(unseen, dtype=np.float64),
             "refused": np.array([self._refused]),
             "refused_ns": np.array(self._refused_ns),

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from rotorwatch.records.replays import ReplayLine, ReplayProgress
-from service.recordings.replay.control import Control
+from service.recordings.replay.player import Control
 from service.recordings.replay.source import clock
 
 Show = Callable[[ReplayProgress], None]

@@ -1,4 +1,4 @@
-"""Runs recordings through the monitor's data path, at full speed, without network or clock.
+"""Runs recordings through the monitor's data path, with a chosen machine file, at full speed, without network or clock.
 
 The blocks meet the same `MachineMonitor` as they would live, so the reports are the same to the last bit. Windows that
 the live monitor skipped, because it could not keep up, are skipped here as well: its recorded reports say which.
@@ -7,22 +7,27 @@ the live monitor skipped, because it could not keep up, are skipped here as well
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 
-from models.commissioning.commissioned import Installed
-from models.errors import RecordingError
+from models.commissioning.commissioned import Installed, install
+from models.diagnosis.networks.bundle import MANIFEST, SHIPPED_BUNDLES
+from models.errors import MachineFileError, RecordingError
+from models.machine import SHIPPED_MACHINES, MachineFile, load_machine_file
+from models.mistakes import changed, checked, parse_toml
 from models.physics.rotor import PARAMETERS
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Report
 from rotorwatch.records.replays import OfflineSummary, ParameterLimits, ReplayProgress
-from service.monitor.alarm_conversion import alarm_cloud_event
+from service.monitor.conversion import alarm_cloud_event
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorReport
-from service.recordings.replay.control import Control
+from service.recordings.replay.player import Control
 from service.recordings.replay.source import RecordingSource
+
+_LONGEST_LINE = 500
 
 
 def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -> list[str]:
@@ -86,15 +91,8 @@ class OfflineReplay:
     def run(
         self, control: Control | None = None, on_progress: Callable[[ReplayProgress], None] = lambda _: None
     ) -> OfflineSummary:
-        """Replay, until the end or until `control` says stop.
-
-        Raises
-        ------
-        RecordingError
-            Where a recording is damaged.
-        """
-        control = Control() if control is None else control
-        begin_s = time.perf_counter()
+        """Replay, until the end or until `control` says stop; raises `RecordingError` where a recording is damaged."""
+        control, begin_s = control or Control(), time.perf_counter()
         keys = {self._keys.stream, self._keys.descriptor}
         for time_ns, message in self._source.timed(keys, from_ns=self._from_ns, to_ns=self._to_ns):
             if control.stopped:
@@ -103,14 +101,11 @@ class OfflineReplay:
             if message.key == self._keys.descriptor:
                 self._describe(message)
                 continue
-            for report in self._monitor.step_payload(
-                message.payload, message.attachment, self._encoding(message.encoding)
-            ):
-                self._note(report)
+            encoding = self._encoding(message.encoding)
+            self._note(self._monitor.step_payload(message.payload, message.attachment, encoding))
             on_progress(self._progress(time_ns))
         if not control.stopped:
-            for report in self._monitor.flush():
-                self._note(report)
+            self._note(self._monitor.flush())
             on_progress(self._progress(self._to_ns - 1))
         return self._summary(time.perf_counter() - begin_s, stopped=control.stopped)
 
@@ -118,13 +113,14 @@ class OfflineReplay:
         found = descriptor_mismatch(message.payload, self._machine)
         self.descriptor_differences = tuple(dict.fromkeys((*self.descriptor_differences, *found)))
 
-    def _note(self, report: MonitorReport) -> None:
-        self._data_s += report.data_s
-        self._windows += len(report.windows)
-        self._alarms += len(report.events)
-        for line in result_lines(self.identity, self._machine.keys, report):
-            self._digest.update(line.encode() + b"\n")
-            self._write(line)
+    def _note(self, reports: Iterable[MonitorReport]) -> None:
+        for report in reports:
+            self._data_s += report.data_s
+            self._windows += len(report.windows)
+            self._alarms += len(report.events)
+            for line in result_lines(self.identity, self._machine.keys, report):
+                self._digest.update(line.encode() + b"\n")
+                self._write(line)
 
     def _encoding(self, encoding: str) -> str:
         """Leave out the schema hash where it differs only because the machine has another name.
@@ -171,3 +167,64 @@ class OfflineReplay:
             stopped=stopped,
             sha256=self._digest.hexdigest(),
         )
+
+
+def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> Installed:
+    """Load the machine file, and what was trained or commissioned, for a recorded machine.
+
+    `wanted` is ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the recorded
+    site and name is taken, with its shipped networks. `changes` are TOML that overrides fields of the machine file.
+
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be used, or none was named and no shipped machine fits.
+    BundleError
+        If the bundle cannot be used, or the machine needs one that was commissioned.
+    """
+    if wanted is not None:
+        before, found, name = wanted.partition(".toml@")  # the name of a folder may hold an @ as well
+        if found or before.endswith(".toml"):
+            file = before + found.removesuffix("@")
+        else:
+            file, _, name = wanted.partition("@")
+        return install(load_machine_file(file, changes), name or None)
+    shipped = sorted(SHIPPED_MACHINES.glob("*.toml"))
+    for path in shipped:
+        machine = load_machine_file(path)
+        if (machine.site, machine.name) == (keys.site, keys.machine):
+            return install(load_machine_file(path, changes), path.stem if is_shipped_bundle(path.stem) else None)
+    names = ", ".join(path.stem for path in shipped)
+    raise MachineFileError(
+        f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({names}) has this site "
+        "and name: name its machine file, as --machine FILE or --machine FILE@BUNDLE"
+    )
+
+
+def check_sent(text: str, changes: str, recorded: str) -> None:
+    """Check the text of a machine file that is to be used for a recorded machine.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the field, the value found and what was expected; also if it is of another machine than ``site/name``.
+    """
+    place = "machine_file"
+    for number, line in enumerate(text.splitlines(), start=1):
+        if len(line) > _LONGEST_LINE:  # reading it may take long: as the square of the length
+            raise MachineFileError(
+                f"{place}: line {number} has {len(line)} characters, at most {_LONGEST_LINE} are read"
+            )
+    machine = checked(MachineFile, changed(parse_toml(text, place), changes), place)
+    if machine.title != recorded:
+        raise MachineFileError(f"{place}: of {machine.title}, the recordings are of {recorded}")
+
+
+def is_shipped_machine(name: str) -> bool:
+    """Whether a machine file of this name is shipped."""
+    return name in {path.stem for path in SHIPPED_MACHINES.glob("*.toml")}
+
+
+def is_shipped_bundle(name: str) -> bool:
+    """Whether trained networks of this name are shipped."""
+    return name in {path.name for path in SHIPPED_BUNDLES.iterdir() if (path / MANIFEST).is_file()}

@@ -1,25 +1,120 @@
-"""Recordings as one stream of messages: several files in time order, one machine, a stretch of time."""
+"""Recordings as one stream of messages: several files in time order, one machine, a stretch of time.
+
+When data were taken is not when they were recorded: a stream that comes faster than real time is recorded in less time
+than it lasts, and a recording that is imported was taken long before. A person who asks for an hour, or for the latest
+20 s, means the time of the data: that of the blocks or, where the samples were not kept, of the window reports.
+"""
 
 import heapq
+import json
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from models.errors import MachineFileError, RecordingError
+from models.errors import MachineFileError, RecordingError, WireError
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.recording import RecordedMessage, RecordingSummary, read_recording, summarize_recording
-from service.recordings.replay.data_time import DataSpan, clock_key, data_start_ns, place_of, span_of
+from models.signals.wire import decode_block
 
 _NANOSECONDS = re.compile(r"\d{1,19}ns")
 _SECONDS = re.compile(r"\+?(\d+(\.\d*)?|\.\d+)s?")
+_BACK_NS = 5 * 10**9
+_STEADY_NS = 10**9
+_LATEST_NS = 2**63
 
 
 @dataclass(frozen=True, slots=True)
-class _File:
-    path: Path
-    summary: RecordingSummary
+class DataSpan:
+    """Data of a machine in a recording."""
+
+    # Beginning of the earliest and end of the latest data.
+    start_ns: int
+    end_ns: int
+    # Beginning of the data recorded first, and end of those recorded last; they differ from the above if the publisher
+    # was started again at an earlier time, or its clock was set.
+    first_ns: int
+    newest_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """When one message's data were taken; sequence and run are None for a report."""
+
+    start_ns: int
+    end_ns: int
+    sequence: int | None = None
+    run: int | None = None
+
+
+def place_of(key: str) -> str:
+    """Common beginning of the keys of a machine; empty for a key that belongs to none.
+
+    Examples
+    --------
+    >>> place_of("rotorwatch/demo/lab/alarm/event"), place_of("weather")
+    ('rotorwatch/demo/lab', '')
+    """
+    parts = key.split("/")
+    return "/".join(parts[:3]) if len(parts) > 3 and parts[0] == PREFIX else ""
+
+
+def clock_key(keys: Collection[str], place: str) -> str | None:
+    """The one of these keys whose messages say when a machine's data were taken; None if there is none."""
+    return next((key for key in (f"{place}/stream", f"{place}/report") if place and key in keys), None)
+
+
+def data_start_ns(message: RecordedMessage) -> int | None:
+    """Time of a block's first sample, or of the last one in a report; None if the message cannot be read."""
+    taken = _taken(message)
+    return None if taken is None else taken.start_ns
+
+
+def span_of(file: RecordingSummary, key: str) -> DataSpan | None:
+    """Time span of the data in the messages of a key; None if none can be read.
+
+    If one run went on without a gap, only the two ends are read.
+
+    Raises
+    ------
+    RecordingError
+        Where damage is met.
+    """
+    first = next(_all_taken(file.path, key), None)
+    if first is None:
+        return None
+    last = first
+    for last in _all_taken(file.path, key, from_ns=file.end_ns - _BACK_NS):  # noqa: B007  # the last one is wanted
+        pass
+    blocks = 0 if last.sequence is None or first.sequence is None else last.sequence - first.sequence
+    expected_ns = blocks * (first.end_ns - first.start_ns)
+    steady = last.run == first.run is not None and abs(last.start_ns - first.start_ns - expected_ns) < _STEADY_NS
+    if steady and blocks > 0:
+        return DataSpan(first.start_ns, last.end_ns, first.start_ns, last.end_ns)
+    start_ns, end_ns = first.start_ns, first.end_ns
+    for last in _all_taken(file.path, key):
+        start_ns, end_ns = min(start_ns, last.start_ns), max(end_ns, last.end_ns)
+    return DataSpan(start_ns, end_ns, first.start_ns, last.end_ns)
+
+
+def _all_taken(path: Path, key: str, from_ns: int | None = None) -> Iterator[_Taken]:
+    found = (_taken(message) for message in read_recording(path, keys={key}, from_ns=from_ns))
+    return (taken for taken in found if taken is not None)
+
+
+def _taken(message: RecordedMessage) -> _Taken | None:
+    if message.key.endswith("/report"):
+        try:
+            end_ns = int(json.loads(message.payload)["end_ns"])
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            return None
+        return _Taken(end_ns - 1, end_ns) if 0 < end_ns < _LATEST_NS else None
+    try:
+        block, _ = decode_block(message.payload, message.attachment, message.encoding)
+    except WireError:
+        return None
+    return _Taken(block.start_ns, block.end_ns, block.sequence, block.run)
 
 
 class RecordingSource:
@@ -28,22 +123,17 @@ class RecordingSource:
     Files may come in any order and may overlap, as a capture around an alarm overlaps the files it was taken from: a
     message that is in both is read once.
 
-    Times are those of the data, see `service.recordings.replay.data_time`, whenever and however fast these were
-    recorded. For a machine without blocks or reports that can be read, the time of recording stands in.
-
-    Raises
-    ------
-    RecordingError
-        If a file is missing, not a recording, incomplete or damaged, or if none holds a message.
+    Times are those of the data, whenever and however fast these were recorded. For a machine without blocks or reports
+    that can be read, the time of recording stands in. Raises `RecordingError` if a file is missing, not a recording,
+    incomplete or damaged, or if none holds a message.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         distinct = dict.fromkeys(path.resolve() for path in paths)
-        files = [_File(path, summarize_recording(path)) for path in distinct]
-        filled = [file for file in files if file.summary.messages]
+        filled = [file for file in map(summarize_recording, distinct) if file.messages]
         if not filled:
             raise RecordingError(f"{', '.join(str(path) for path in paths)}: contains no messages")
-        self._files = sorted(filled, key=lambda file: (file.summary.start_ns, file.summary.end_ns))
+        self._files = sorted(filled, key=lambda file: (file.start_ns, file.end_ns))
         self._spans: dict[tuple[Path, str], DataSpan | None] = {}
 
     @property
@@ -60,7 +150,7 @@ class RecordingSource:
     @property
     def keys(self) -> frozenset[str]:
         """Every key that occurs."""
-        return frozenset(key for file in self._files for key in file.summary.messages)
+        return frozenset(key for file in self._files for key in file.messages)
 
     @property
     def machines(self) -> tuple[MachineKeys, ...]:
@@ -110,12 +200,8 @@ class RecordingSource:
         places = {place_of(keys.stream) for keys in machines} or {place_of(key) for key in self.keys}
         found = [span for file in self._files for place in sorted(places) if (span := self._span(file, place))]
         found = found or [_recorded(file) for file in self._files]
-        return DataSpan(
-            min(span.start_ns for span in found),
-            max(span.end_ns for span in found),
-            found[0].first_ns,
-            found[-1].newest_ns,
-        )
+        start_ns, end_ns = min(span.start_ns for span in found), max(span.end_ns for span in found)
+        return DataSpan(start_ns, end_ns, found[0].first_ns, found[-1].newest_ns)
 
     def between(self, from_: str | None, to: str | None, *machines: MachineKeys) -> tuple[int, int]:
         """Start, and end (exclusive), of the data that ``--from`` and ``--to`` ask for, of these machines or of all.
@@ -137,15 +223,13 @@ class RecordingSource:
 
     def descriptor(self, keys: MachineKeys, before_ns: int | None = None) -> RecordedMessage | None:
         """Channel descriptor that held at a time; without a time, or if there was none by then, the first."""
-        first: RecordedMessage | None = None
-        latest: RecordedMessage | None = None
-        for message in self.messages({keys.descriptor}):
-            first = first or message
-            if before_ns is None:
-                break
-            if self._following_ns(keys, message) <= before_ns:
-                latest = message
-        return latest or first
+        messages = self.messages({keys.descriptor})
+        found = next(messages, None)
+        if before_ns is not None:
+            for message in messages:
+                if self._following_ns(keys, message) <= before_ns:
+                    found = message
+        return found
 
     def messages(
         self, keys: Collection[str] | None = None, *, from_ns: int | None = None, to_ns: int | None = None
@@ -179,7 +263,7 @@ class RecordingSource:
                 for place in _places(file, wanted):
                     if span := self._span(file, place):
                         reached.setdefault(place, span.first_ns)
-                        clocks |= {key for key in (clock_key(file.summary.messages, place),) if key}
+                        clocks |= {key for key in (clock_key(file.messages, place),) if key}
             for message in _read(inside, None if wanted is None else wanted | clocks):
                 place = place_of(message.key)
                 if message.key in clocks:
@@ -193,15 +277,17 @@ class RecordingSource:
                 ):
                     yield time_ns, message
 
-    def _span(self, file: _File, place: str) -> DataSpan | None:
+    def _span(self, file: RecordingSummary, place: str) -> DataSpan | None:
         """Data of a machine in one file, read once."""
         known = (file.path, place)
         if known not in self._spans:
-            key = clock_key(file.summary.messages, place)
-            self._spans[known] = None if key is None else span_of(file.path, file.summary, key)
+            key = clock_key(file.messages, place)
+            self._spans[known] = None if key is None else span_of(file, key)
         return self._spans[known]
 
-    def _touches(self, file: _File, keys: frozenset[str] | None, from_ns: int | None, to_ns: int | None) -> bool:
+    def _touches(
+        self, file: RecordingSummary, keys: frozenset[str] | None, from_ns: int | None, to_ns: int | None
+    ) -> bool:
         """Whether a file has messages of these keys between two times."""
         spans = [self._span(file, place) or _recorded(file) for place in _places(file, keys)]
         return any(
@@ -212,40 +298,39 @@ class RecordingSource:
         """Time of the first data that were recorded after a message."""
         since_ns = message.log_time_ns
         for file in self._files:
-            if file.summary.end_ns >= since_ns and keys.stream in file.summary.messages:
+            if file.end_ns >= since_ns and keys.stream in file.messages:
                 for block in read_recording(file.path, keys={keys.stream}, from_ns=since_ns):
                     if (start_ns := data_start_ns(block)) is not None:
                         return start_ns
         return since_ns
 
-    def _overlapping(self) -> Iterator[list[_File]]:
+    def _overlapping(self) -> Iterator[list[RecordingSummary]]:
         """Groups of files that do not overlap in time with other groups, so that few files are open at a time."""
-        group: list[_File] = []
+        group: list[RecordingSummary] = []
         end_ns = 0
         for file in self._files:
             # Files of a rotating recorder may meet in one nanosecond; order of reading is then order of starting.
-            if group and file.summary.start_ns >= end_ns:
+            if group and file.start_ns >= end_ns:
                 yield group
                 group = []
             group.append(file)
-            end_ns = max(end_ns, file.summary.end_ns)
+            end_ns = max(end_ns, file.end_ns)
         yield group
 
 
-def _places(file: _File, keys: frozenset[str] | None) -> set[str]:
+def _places(file: RecordingSummary, keys: frozenset[str] | None) -> set[str]:
     """Machines of which a file has messages of these keys."""
-    return {place_of(key) for key in file.summary.messages if keys is None or key in keys}
+    return {place_of(key) for key in file.messages if keys is None or key in keys}
 
 
-def _recorded(file: _File) -> DataSpan:
+def _recorded(file: RecordingSummary) -> DataSpan:
     """Times of recording, for files whose data give no time."""
-    start_ns, end_ns = file.summary.start_ns, file.summary.end_ns
-    return DataSpan(start_ns, end_ns, start_ns, end_ns)
+    return DataSpan(file.start_ns, file.end_ns, file.start_ns, file.end_ns)
 
 
-def _read(files: Sequence[_File], keys: frozenset[str] | None) -> Iterator[RecordedMessage]:
+def _read(files: Sequence[RecordingSummary], keys: frozenset[str] | None) -> Iterator[RecordedMessage]:
     """Messages of files that may overlap, in the order of recording."""
-    inside = [file for file in files if keys is None or keys & file.summary.messages.keys()]
+    inside = [file for file in files if keys is None or keys & file.messages.keys()]
     if len(inside) == 1:
         yield from read_recording(inside[0].path, keys=keys)
     else:

@@ -23,7 +23,7 @@ from service.analysis.snapshots.plots import (
 )
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
-from service.runtime.standing import latest_from_bytes, latest_to_bytes
+from service.runtime.remote import latest_from_bytes, latest_to_bytes
 from service.stream.worker import held_now
 from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT, RIG

@@ -24,7 +24,7 @@ from service.analysis.overview import overview
 from service.delivery import event_feed
 from service.delivery.event_feed import CursorError, EventFeed, cursor_text, parsed_cursor
 from service.history.records import StoreError
-from service.monitor.alarms.operation import OperatorAction
+from service.monitor.alarms.alarm import OperatorAction
 from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import MachineEntry

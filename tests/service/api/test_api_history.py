@@ -18,8 +18,8 @@ from rotorwatch.records.history import AlarmEventList, AuditList
 from rotorwatch.records.snapshots import OrbitSnapshot
 from rotorwatch.records.windows import Equation, Parameter
 from service.monitor import conversion
-from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.conversion import alarm_cloud_event
 from service.monitor.reports import MachineHealth, identity_of, machine_hash
 from service.runtime.runtime import Runtime
 from tests.service.rig.live import LAB, START_NS, Feed, until

@@ -12,10 +12,20 @@ from hypothesis import strategies as st
 from models.alarm_names import ALARMS
 from models.machine import AlarmSettings
 from rotorwatch.records.alarms import AlarmState, EventKind
-from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.alarms.alarm import (
+    KIND_OF_EVENT,
+    OWED,
+    REFUSED,
+    STAYS,
+    TABLE,
+    Alarm,
+    AlarmEvent,
+    Cell,
+    OperationRefused,
+    OperatorAction,
+    follow,
+)
 from service.monitor.alarms.book import AlarmBook
-from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, follow
-from service.monitor.alarms.operation import KIND_OF_EVENT, OperationRefused, OperatorAction
 
 ROOT = Path(__file__).parents[3]
 S = 10**9

@@ -24,8 +24,8 @@ from rotorwatch.records.health import HealthState, Report
 from service.history.machine import MachineStore
 from service.history.records import Checkpoint, Step, StoreError
 from service.history.store import Store
+from service.monitor.alarms.alarm import OperatorAction
 from service.monitor.alarms.book import AlarmBook
-from service.monitor.alarms.operation import OperatorAction
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, identity_of
 from service.settings.service import QueueSettings

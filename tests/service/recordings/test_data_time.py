@@ -16,10 +16,8 @@ from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall
 from service.commands.replay import summary_lines
 from service.commands.rotorwatch import app
-from service.recordings.replay.control import Control
-from service.recordings.replay.data_time import data_start_ns
-from service.recordings.replay.player import PlayPlan, play
-from service.recordings.replay.source import RecordingSource
+from service.recordings.replay.player import Control, PlayPlan, play
+from service.recordings.replay.source import RecordingSource, data_start_ns
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
 from tests.service.rig.replaying import hurried, recording, split, write
 from tests.sure import sure

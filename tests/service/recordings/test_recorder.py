@@ -17,10 +17,9 @@ from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
 from models.signals.salvage import inspect_recording, salvage_recording
 from models.signals.wire import encode_block
-from service.recordings.backlog import Backlog
 from service.recordings.catalogue import Catalogue
 from service.recordings.leftovers import is_locked
-from service.recordings.recorder import MachineRecorder
+from service.recordings.recorder import Backlog, MachineRecorder
 from service.settings.service import RecordingSettings, ServiceSettings
 from tests.loopback import session_of
 from tests.service.recordings.test_recorder_killed import Sender

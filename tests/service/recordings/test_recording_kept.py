@@ -19,15 +19,17 @@ from rotorwatch.records.example import example
 from service.history.records import StoredEvent, StoreError
 from service.recordings.catalogue import (
     PART,
+    AlarmMark,
     Catalogue,
     Recording,
+    alarm_mark,
+    decide,
     kept_reasons,
     name_of,
     recent_messages,
     recorded_files,
 )
 from service.recordings.recorder import MachineRecorder
-from service.recordings.retention import AlarmMark, alarm_mark, decide
 from service.runtime.runtime import Runtime
 from service.settings.service import RecordingSettings
 from tests.service.history.test_store import alarm_event

@@ -13,8 +13,8 @@ from models.commissioning.commissioned import install
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from rotorwatch.records.replays import OfflineSummary
-from service.recordings.replay.control import Control
 from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.player import Control
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import running
 from service.stream.replay_link import replay_to_network

@@ -11,7 +11,7 @@ import zenoh
 
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, read_recording
-from service.recordings.replay.control import Control
+from service.recordings.replay.player import Control
 from service.recordings.replay.source import RecordingSource
 from service.stream.inbox import RawBlock
 from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network

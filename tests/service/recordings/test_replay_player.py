@@ -11,8 +11,7 @@ from models.errors import MachineFileError, RecordingError
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.replays import ReplayProgress
 from service.recordings.replay.console import obey
-from service.recordings.replay.control import Control
-from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.player import Control, PlayPlan, play
 from service.recordings.replay.source import RecordingSource, parse_moment
 from tests.service.rig.live import until
 from tests.service.rig.replaying import write

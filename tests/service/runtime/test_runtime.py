@@ -20,7 +20,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from service.api.server import HttpError
-from service.monitor.alarm_conversion import alarm_cloud_event
+from service.monitor.conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
 from service.runtime.runtime import Runtime, running

@@ -14,8 +14,7 @@ from structlog.testing import capture_logs
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmLogPage
 from service.history.records import StoreError
-from service.stream.inbox import Inbox, RawBlock
-from service.stream.intake import Intake
+from service.stream.inbox import Inbox, Intake, RawBlock
 from service.stream.transport import MachineCallbacks, MachineLink, TopicMessage, follow
 from tests.service.rig.live import (
     LAB,
