@@ -29,7 +29,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
-from types import FrameType
 from typing import IO
 
 import httpx
@@ -44,6 +43,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Report
 from service.stream.transport import TopicMessage, follow
 from service.terminal.lines import alarm_event_line, report_heading, report_row, with_minus_signs
+from service.terminal.stopping import handled
 
 FAULTS = {"k_by": -0.25, "c_by": -0.30, "k_bz": -0.25, "c_bz": -0.30, "e": 0.30}
 """Faults as relative changes of parameters; the simulator's scenarios of these names apply the same changes."""
@@ -163,7 +163,8 @@ def run_demo(options: DemoOptions) -> int:
     console = Console(highlight=False)
     console.width = min(console.width, _WIDTH) if console.is_terminal else _WIDTH
     with ExitStack() as stack:
-        stack.enter_context(_interruptible())
+        # A termination signal is treated like Ctrl-C, so that the programs are stopped in order.
+        stack.enter_context(handled((signal.SIGTERM, signal.SIGHUP), signal.default_int_handler))
         try:
             passed = _Show(options, console).run(stack)
         except KeyboardInterrupt:
@@ -381,22 +382,6 @@ def _wait_until_ready(url: str, monitor: _Program) -> None:
                 pass
             time.sleep(0.1)
     raise RotorwatchError(f"the monitor was not ready after {_START_S:g} s")
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Treat a termination signal like Ctrl-C, so that the programs are stopped in order."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        del signum, frame
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _command() -> str:
