@@ -184,10 +184,8 @@ def replay(
             for change in set_ or ():
                 if "=" not in change:
                     raise MachineFileError(f"--set {change!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
-            changes = "\n".join(set_ or ())
-            chosen = (source.machine(key),) if ray is None else machines
-            tasks = []
-            for one in chosen:
+            changes, tasks = "\n".join(set_ or ()), []
+            for one in (source.machine(key),) if ray is None else machines:
                 recorded = source.paths_between(from_ns, to_ns, frozenset({one.stream}))
                 tasks.append(MachineTask(f"{one.site}/{one.machine}", recorded, wanted(one), changes, from_ns, to_ns))
             if ray is None:
@@ -268,11 +266,9 @@ def _evaluate_all(
     typer.echo(f"{len(tasks)} machines in {len(source.paths)} recordings ...", err=True)
     for done, (summary, text) in enumerate(on_cluster(ray, tasks), start=1):
         file, data_s = _file_of(folder, f"{summary.site}/{summary.machine}"), data_s + summary.data_s
-        try:
+        with _report_write_errors(file):
             folder.mkdir(parents=True, exist_ok=True)
             file.write_text(text, encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise MachineFileError(f"{file}: cannot be written ({error.strerror or error})") from error
         raised = f", raised at the end: {', '.join(summary.raised)}" if summary.raised else ""
         typer.echo(
             f"{done:4d} of {len(tasks)}  {summary.site}/{summary.machine}: {summary.data_s:.0f} s of data, "
@@ -429,14 +425,21 @@ def _check_prefix(option: str, prefix: str) -> None:
         )
 
 
-def link_of(connect: list[str] | None, listen: list[str] | None, link: Path | None = None) -> "LinkSettings":
-    """Link settings from the command line or a file; endpoints on the command line replace the file's and its role."""
+def link_of(
+    connect: list[str] | None,
+    listen: list[str] | None,
+    link: Path | None = None,
+    settings: "LinkSettings | None" = None,
+) -> "LinkSettings":
+    """Link settings of a file, or else `settings`; endpoints on the command line replace all of them and the role."""
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.link import LinkSettings, load_link  # noqa: PLC0415
 
+    # A router forwards between clients, but not between peers, which it assumes to be connected to each other.
     ends = {"mode": "peer" if listen else "client", "listen": tuple(listen or ()), "connect": tuple(connect or ())}
-    if link is not None:
-        return load_link(link).model_copy(update=ends if listen or connect else {})
+    base = settings if link is None else load_link(link)
+    if base is not None:
+        return base.model_copy(update=ends if listen or connect else {})
     return checked(LinkSettings, ends if listen or connect else ends | {"connect": (ENDPOINT,)}, "command line")
 
 
