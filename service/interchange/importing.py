@@ -20,8 +20,7 @@ from models.machine import MachineFile
 from models.signals.block import lowest_valid_hz, settling_s
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
-from service.interchange.angle import AngleColumn, pulse_times, read_pulses
-from service.interchange.blocks import BlockMaker, Written
+from service.interchange.blocks import AngleColumn, BlockMaker, Written, pulse_times, read_pulses
 from service.interchange.clock import Clock, clock_for
 from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
 from service.interchange.mapping import Mapping
@@ -144,19 +143,13 @@ def _imported(
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise
+    others = set(path.iterdir()) - {one.path for one in files} if path.is_dir() else set()
+    left_out = sorted(one.name for one in others if not one.name.startswith("."))
     by_name = path.is_dir() and mapping.time.start is None and files[0].start_ns is not None
-    written = maker.written
-    left_out, doubts = _left_out(path, files), [signal.doubt for signal in signals if signal.doubt]
+    doubts = [signal.doubt for signal in signals if signal.doubt]
     return Imported(
-        path, recording, machine, mapping, clock, read, written, angle, cut_rows, left_out, [], by_name, doubts
+        path, recording, machine, mapping, clock, read, maker.written, angle, cut_rows, left_out, [], by_name, doubts
     )
-
-
-def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
-    if not path.is_dir():
-        return []
-    names = {one.path.name for one in files}
-    return sorted(one.name for one in path.iterdir() if one.name not in names and not one.name.startswith("."))
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut_rows: int) -> str:
@@ -223,8 +216,7 @@ def summary_lines(done: Imported) -> list[str]:
 
 
 def _folder_lines(done: Imported) -> list[str]:
-    names = done.left_out
-    lines = []
+    lines, names = [], done.left_out
     if done.by_name:
         zone = done.mapping.time.zone or "UTC (if they are local time, say time.zone in the mapping)"
         lines.append(f"times: those in the file names, in {zone}")
