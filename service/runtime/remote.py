@@ -9,8 +9,7 @@ from models.commissioning.commissioned import install
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.machines import DetectableChanges
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.history.records import StoreError
 from service.history.store import Store
 from service.monitor.alarms.operation import (

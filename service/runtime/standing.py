@@ -14,7 +14,7 @@ from models.signals.waveform import Waveform
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import Parameter, SensorFault
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.monitor.alarms.operation import OperatorAction
 from service.stream.monitored import MachineStatus
 
