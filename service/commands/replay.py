@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which would delay
     from service.recordings.replay.source import RecordingSource
     from service.runtime.archive import MachineTask
     from service.stream.replay_link import NetworkPlan
-    from service.terminal.stopping import StopRequest
 
 commands = typer.Typer()
 _SLOWEST, _FASTEST = 0.1, 1000.0
@@ -301,25 +300,22 @@ def _machines_of(config: Path | None, machine: str | None) -> "Callable[[Machine
     return named
 
 
-def summary_lines(summary: "OfflineSummary") -> list[str]:
+def summary_lines(summary: "OfflineSummary") -> Iterator[str]:
     """Describe the result of an offline replay in lines of text."""
     refused = ", ".join(f"{count} {reason}" for reason, count in summary.refused_blocks.items())
-    lines = [
-        f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}",
-        f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: "
-        f"{', '.join(summary.raised) or 'none'}",
-        f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time",
-        f"{summary.blocks} blocks accepted, refused: {refused or 'none'}"
-        + (f"; latest reason: {summary.last_refusal}" if refused else ""),
-    ]
+    raised = ", ".join(summary.raised) or "none"
+    latest = f"; latest reason: {summary.last_refusal}" if refused else ""
+    yield f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}"
+    yield f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: {raised}"
+    yield f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time"
+    yield f"{summary.blocks} blocks accepted, refused: {refused or 'none'}{latest}"
     if summary.skipped_windows:
-        lines.append(f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up")
+        yield f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up"
     if summary.gaps:
-        lines.append(f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing")
+        yield f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing"
     if summary.stopped:
-        lines.append("stopped before the end")
-    lines.append(f"SHA-256 of the lines {summary.sha256}")
-    return lines
+        yield "stopped before the end"
+    yield f"SHA-256 of the lines {summary.sha256}"
 
 
 @contextmanager
@@ -364,21 +360,17 @@ def _stoppable(control: "Control") -> Iterator[None]:
     """Stop the replay cleanly on SIGINT and SIGTERM."""
     from service.terminal.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
 
-    over = threading.Event()
-
-    def watch(stop: "StopRequest") -> None:
-        while not over.is_set():
-            if stop.wait(0.25):
-                control.stop()
-                return
+    def watch() -> None:
+        stop.wait()
+        control.stop()
 
     with stop_request() as stop:
-        thread = threading.Thread(target=watch, args=(stop,), name="signals", daemon=True)
+        thread = threading.Thread(target=watch, name="signals", daemon=True)
         thread.start()
         try:
             yield
         finally:
-            over.set()
+            stop.ask()  # ends the thread; the replay is over
             thread.join()
 
 
