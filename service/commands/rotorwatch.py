@@ -309,10 +309,9 @@ def demo(
     prepare_numerics()
     typer.echo("starting a simulated machine and a monitor (some seconds) ...")
     sys.stdout.flush()
-    from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
+    from service.commands.demo import run_demo  # noqa: PLC0415  # keeps --help quick
 
-    code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
-    raise typer.Exit(code)
+    raise typer.Exit(run_demo(fault, seed, pace, once, http_port))
 
 
 def _checked(file: Path) -> str:
