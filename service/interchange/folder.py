@@ -191,17 +191,13 @@ def unusable(files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFi
         except SourceError as error:
             faults[file.path] = error
     if machine.schedule is not None and isinstance(mapping.time.start, datetime):
-        forms = {_form(file.path) for file in files if file.path not in faults}
+        forms = {re.sub(r"\d+", "0", file.path.name) for file in files if file.path not in faults}
         for path, fault in faults.items():
-            if forms and _form(path) not in forms:
+            if forms and re.sub(r"\d+", "0", path.name) not in forms:
                 raise SourceError(
                     f"{fault}; whether it counts among the others its name does not say: move it out of the folder"
                 )
     return faults
-
-
-def _form(path: Path) -> str:
-    return re.sub(r"\d+", "0", path.name)
 
 
 def runs_of_pulses(
