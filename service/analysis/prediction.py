@@ -246,17 +246,9 @@ class Prediction:
     def spectra(
         self, states: tuple[str, ...], frequencies_hz: FloatArray
     ) -> tuple[ComplexArray | None, ComplexArray | None]:
-        """Expected cross-spectra of the segments, two-sided, SI²/Hz, shape (n_lines, n, n).
+        """Expected cross-spectra of the segments, two-sided, SI²/Hz, nominal and estimated; None without a prediction.
 
-        Parameters
-        ----------
-        frequencies_hz : ndarray, shape (n_lines,)
-            Lines of the window's spectrum, evenly spaced.
-
-        Returns
-        -------
-        nominal, estimated : ndarray or None
-            None if there is no prediction.
+        The frequencies are lines of the window's spectrum, evenly spaced; the shape is (n_lines, n, n).
         """
         if self.excitation is None or self.machine is None:
             return None, None

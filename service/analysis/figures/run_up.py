@@ -21,7 +21,6 @@ from models.signals.block import FloatArray
 from service.analysis.figures.style import (
     COLOURS,
     GREY,
-    INK,
     PLATE,
     Look,
     Paint,
@@ -215,12 +214,9 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
 
 def _frame(axes: Axes, names: tuple[str, str], start: str, path: FloatArray, clearance_um: float | None) -> None:
     """Set limits with equal scales on both axes, and state the start position."""
-    frame_plane(axes, names, "µm from the start")
     if clearance_um is not None:
         start += f"\ncircle: clearance of {clearance_um:g} µm, if the shaft lies at its bottom to begin with"
-    axes.text(
-        0.02, 0.985, start, transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, bbox=PLATE, zorder=6,
-    )  # fmt: skip
+    frame_plane(axes, names, "µm from the start", start, bbox=PLATE, zorder=6)
     half = clearance_um / 2 if clearance_um else 0.0
     left, bottom = np.minimum(path.min(axis=0), (-half, 0.0)).tolist()
     right, top = np.maximum(path.max(axis=0), (half, 2 * half)).tolist()
