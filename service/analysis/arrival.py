@@ -49,13 +49,10 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         others = sorted({one.key for one in messages})
         heard = f"; heard were {', '.join(others)}" if others else ""
         return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
-    gate, refused, accepted, breaks = (
-        Gate(machine, partial=True),
-        Counter[str](),
-        list[SampleBlock](),
-        list[Admission](),
-    )
-    rates, missing = set[float](), MissingNumbers(machine.sensors)
+    gate, missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
+    refused, rates = Counter[str](), set[float]()
+    accepted: list[SampleBlock] = []
+    breaks: list[Admission] = []
     for message in stream:
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
@@ -79,13 +76,11 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             "for example:"
         )
     troubles += [one.text for one in breaks[:_MOST_BREAKS]]
-    for text, count in refused.most_common(5):
-        troubles.append(f"{count} blocks would be refused: {text}")
+    troubles += [f"{count} blocks would be refused: {text}" for text, count in refused.most_common(5)]
     lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(refused.values())} of them usable"]
     if rates:
-        lines.append(
-            f"sampling rate {', '.join(f'{rate:g}' for rate in sorted(rates))} Hz, expected {machine.rate_hz:g}"
-        )
+        found = ", ".join(f"{rate:g}" for rate in sorted(rates))
+        lines.append(f"sampling rate {found} Hz, expected {machine.rate_hz:g}")
     if accepted:
         troubles += [fault.text for fault in missing.found(accepted[0].start_ns, accepted[-1].end_ns)]
         lines += _of_samples(machine, accepted, troubles)

@@ -159,18 +159,18 @@ def measured_correlations(
     segment_s = machine.window.segment_s
     lags_s = plan_for(machine).lags_s
     lags_s = lags_s[lags_s <= segment_s / 2]
-    spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
-    band_hz = (window.frequencies_hz[0] - spacing_hz / 2, window.frequencies_hz[-1] + spacing_hz / 2)
+    lowest_hz, highest_hz = float(window.frequencies_hz[0]), float(window.frequencies_hz[-1])
+    spacing_hz = float(window.frequencies_hz[1]) - lowest_hz
+    band_hz = (lowest_hz - spacing_hz / 2, highest_hz + spacing_hz / 2)
     turn = np.exp(-2j * np.pi * np.outer(lags_s, window.frequencies_hz))
-    values = (
-        2 * spacing_hz * (turn @ window.spectrum[:, reference, response]).real / _hann_fade(lags_s / segment_s)[:, None]
-    )
+    cross = window.spectrum[:, reference, response]
+    values = 2 * spacing_hz * (turn @ cross).real / _hann_fade(lags_s / segment_s)[:, None]
     zero = window.correlation[0]
     rms = np.sqrt(zero[reference, reference] * zero[response, response])
     with np.errstate(invalid="ignore", divide="ignore"):  # a channel without motion gives NaN
         outside = (zero[reference, response] - values[0]) / rms
     errors = _bartlett_errors(window, reference, response, turn, spacing_hz)
-    return MeasuredCorrelations(lags_s, values, errors, (float(band_hz[0]), float(band_hz[1])), outside)
+    return MeasuredCorrelations(lags_s, values, errors, band_hz, outside)
 
 
 def _bartlett_errors(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +62,7 @@ class Ellipse:
         return abs(abs(self._forward) - abs(self._backward))
 
     @property
-    def precession(self) -> str:
+    def precession(self) -> Literal["forward", "backward"]:
         """``forward`` if the orbit is traversed from y to z as θ grows, else ``backward``."""
         return "forward" if abs(self._forward) >= abs(self._backward) else "backward"
 

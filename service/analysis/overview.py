@@ -41,28 +41,19 @@ def nearness(report: Report) -> dict[str, float]:
 
     The page chooses what it shows of a machine by the same rule (``monitor/states.js``).
     """
-    near = {one.name: _parameter_nearness(report, one) for one in _readings(report)}
+    verdict, detectable = report.verdict, {one.name: one for one in report.detectable}
+    near: dict[str, float] = {}
+    for read in () if verdict is None else report.parameters if verdict.settled else verdict.current:
+        change = read.relative_change
+        if change is not None and read.standard_error is not None:
+            seen = detectable.get(read.name)
+            least = 0.0 if seen is None else seen.loss if change < 0 else seen.gain
+            near[read.name] = change / least if least else 0.0
     return near | {f"level:{one.channel}": _level_nearness(one) for one in report.levels}
 
 
 def _named(parameters: Iterable[Parameter], names: set[str]) -> tuple[Parameter, ...]:
     return tuple(one for one in parameters if one.name in names)
-
-
-def _readings(report: Report) -> tuple[Parameter, ...]:
-    """Readings of the machine's current state that have a value and a standard error."""
-    if report.verdict is None:
-        return ()
-    current = report.parameters if report.verdict.settled else report.verdict.current
-    return tuple(one for one in current if one.relative_change is not None and one.standard_error is not None)
-
-
-def _parameter_nearness(report: Report, read: Parameter) -> float:
-    """Relative change over the minimum detectable change; 0 if there is none."""
-    change = read.relative_change or 0.0
-    seen = next((one for one in report.detectable if one.name == read.name), None)
-    least = 0.0 if seen is None else seen.loss if change < 0 else seen.gain
-    return change / least if least else 0.0
 
 
 def _level_nearness(levels: ChannelLevels) -> float:

@@ -95,9 +95,8 @@ class Past(Described):
             database.stop()
         if not reports:
             raise RotorwatchError(f"{settings}: no reports of {name} in this stretch of time")
-        return cls(
-            machine, name, str(settings), reports, tuple(one.text for one in alarms if since <= one.time_ns < until)
-        )
+        texts = tuple(one.text for one in alarms if since <= one.time_ns < until)
+        return cls(machine, name, str(settings), reports, texts)
 
 
 def parsed_reports(texts: Iterable[str | bytes]) -> Iterator[Report]:

@@ -1,28 +1,32 @@
 """Theory for one window: spectra and correlation functions of the nominal machine, and of the machine as estimated.
 
-Both use the same excitation, which is estimated from the window with the estimated machine (with the nominal one if
-there is no estimate), so they differ by the effect of the parameters alone. Spectra are averaged with the spectral
-kernel of the segments, as the measured spectra are. Correlation functions are their Fourier transforms (Eq. 18),
+Both use the same excitation, which is not measured, but estimated from the window with the estimated machine (with the
+nominal one if there is no estimate), so they differ by the effect of the parameters alone. Spectra are averaged with
+the spectral kernel of the segments, as the measured spectra are. Correlation functions are their Fourier transforms
+(Eq. 18),
 
     R_ij(τ) = 2 Re ∫ S_ij(f) e^{-2πjfτ} df,
 
 by Gauss-Legendre quadrature over panels that are narrow around the natural frequencies.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.likelihood.motions import group_bins
+from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins, integrated
+from models.diagnosis.likelihood.scoring import FisherScoring
+from models.diagnosis.likelihood.spectral_model import SpectralModel, starting_point, usual_force
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.rotor import PARAMETERS, RotorParameters, changed, system_A
+from models.physics.excitation import low_pass
+from models.physics.rotor import COORDINATES, PARAMETERS, RotorParameters, changed, system_A
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
-from service.analysis.excitation import Excitation, excitation_of
 
 NOTHING_READ = "no parameter was read in this window"
 NO_PARAMETERS = "the machine's parameters are not known, so there is no theory to predict from"
@@ -33,6 +37,194 @@ _MOST_PANEL_CYCLES = 1.2
 """Largest width of a panel times the longest lag, i.e. periods of e^{-2πjfτ} in one panel."""
 _GROWTH = 0.05
 _OVER_BAND = 4.0
+LEFT_OUT_BINS = 3
+"""Lines on either side of 1× that are excluded: the remainder of 1× there is not stochastic."""
+_GROUPS = 150
+_FIXING_RIDGE = 1e9
+_STEPS, _NEAR, _GAIN = 60, 0.15, 3.0
+_COLOUR_RIDGE = 2000.0
+"""Ridge strength on the forces' own colours: keeps them close to one common colour unless the window says otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """Forces and sensor noise of one window."""
+
+    machine: Machine  # with the rotor for which the forces were estimated
+    motions: Motions  # what was measured
+    theta: FloatArray  # parameters of `SpectralModel`, with all structural ratios at 0
+    force_scale: float  # the model's unit of force, N/√Hz
+    speed_rad_s: float  # speed of the gyroscopic terms
+    # ln d₀ and b of every sensor's noise (see `_noise_density`), by state; an accelerometer's noise is given as that of
+    # the velocity to which it was integrated.
+    noise: dict[str, FloatArray]
+
+    def spectra(self, rotor: RotorParameters, states: tuple[str, ...], frequencies_hz: FloatArray) -> ComplexArray:
+        """Cross-spectra of a rotor's states under this excitation, two-sided, SI²/Hz, shape (n_frequencies, n, n).
+
+        The states may be measured states and accelerations; sensor noise is included. Outside the window's band the
+        forces' low-pass continues, while their colour and the noise keep the values at the band's edge.
+        """
+        low_hz, high_hz = self.machine.window.band_hz
+        size = frequencies_hz.size
+        one = np.ones((size, 1))
+        lines = BinGroups(
+            edges=tuple((k, k + 1) for k in range(size)),
+            bins=one[:, 0],
+            centre_hz=np.clip(frequencies_hz, low_hz, high_hz),
+            nodes_hz=frequencies_hz[:, None],
+            weights=one,
+            shared=np.empty((0, 0)),
+        )
+        machine = self.machine.model_copy(update={"rotor": rotor})
+        model = SpectralModel(machine, self.motions, lines, self.force_scale)
+        point = model.at(self.theta, self.speed_rad_s)
+        w = 2 * np.pi * frequencies_hz
+        gain = low_pass(frequencies_hz, *model.filter(self.theta))
+        dofs = [_dof(state) for state in states]
+        seen = point.H[:, 0][:, dofs] * np.stack([(1j * w) ** _order(state) for state in states], axis=1)[:, :, None]
+        spectra = (seen * gain[:, None, None]) @ point.C @ seen.conj().transpose(0, 2, 1)
+        diagonal = np.arange(len(states))
+        spectra[:, diagonal, diagonal] += np.stack([self._noise(state, frequencies_hz) for state in states], axis=1)
+        return np.asarray(spectra, dtype=np.complex128)
+
+    def _noise(self, state: str, frequencies_hz: FloatArray) -> FloatArray:
+        """Noise density of one sensor, SI²/Hz; zero if the likelihood did not use the sensor."""
+        low_hz, high_hz = self.machine.window.band_hz
+        within_hz = np.clip(frequencies_hz, low_hz, high_hz)
+        if state in self.noise:
+            return _noise_density(self.noise[state], within_hz, high_hz)
+        velocity = state.replace("_ddot", "_dot")
+        if velocity in self.noise and velocity not in self.machine.descriptor.states:
+            return (2 * np.pi * within_hz) ** 2 * _noise_density(self.noise[velocity], within_hz, high_hz)
+        return np.zeros_like(frequencies_hz)
+
+
+def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
+    """Estimate the excitation with which a machine best explains a window, its rotor parameters held.
+
+    The likelihood estimates a level matrix of all forces, a low-pass, a smooth colour of each force, and the noise of
+    each sensor (`models.diagnosis.likelihood.spectral_model`).
+
+    Raises
+    ------
+    EstimationError
+        If a channel shows no fluctuation, or the search finds no finite excitation.
+    """
+    window = integrated(window)
+    speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
+    frequencies_hz = window.frequencies_hz
+    spacing_hz = float(frequencies_hz[1] - frequencies_hz[0])
+    excluded = np.abs(frequencies_hz - abs(speed) / (2 * np.pi)) <= LEFT_OUT_BINS * spacing_hz
+    power = np.einsum("fii->i", window.spectrum[~excluded]).real / np.count_nonzero(~excluded)
+    still = [state for state, one in zip(window.states, power, strict=True) if not one > 0]
+    if still:
+        raise EstimationError(f"{machine.title}: no fluctuation in {', '.join(still)}: nothing to compare with theory")
+    motions = Motions(window.states, np.sqrt(power))
+    low_hz, high_hz = machine.window.band_hz
+    groups = group_bins(frequencies_hz, machine, np.asarray(excluded, dtype=np.bool_), (high_hz - low_hz) / _GROUPS)
+    usual_cutoff_hz = math.sqrt(math.prod(machine.condition.cutoff_hz))
+    force_scale = usual_force(machine, motions, groups, speed, usual_cutoff_hz)
+    model = SpectralModel(machine, motions, groups, force_scale)
+    observed = motions.spectra(groups.average(window.spectrum), model.centre)
+    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _COLOUR_RIDGE)
+    search.weights.ridge[: model.cutoff_at] = _FIXING_RIDGE
+    try:
+        # Trial points may overflow: the result is checked below, so no warnings are needed.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            start = starting_point(model, observed, search.weights.centre, speed)
+            theta = search.maximise(start, _STEPS, _NEAR, _GAIN).theta
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"{machine.title}: no excitation explains this window with these parameters: {error}"
+        ) from error
+    if not np.all(np.isfinite(theta)):
+        raise EstimationError(f"{machine.title}: no excitation explains this window with these parameters")
+    theta = theta.copy()
+    theta[: model.cutoff_at] = 0.0
+    noise = _noise_of(machine, model, theta, window, speed)
+    return Excitation(machine, motions, theta, force_scale, speed, noise)
+
+
+def _noise_of(
+    machine: Machine, model: SpectralModel, theta: FloatArray, window: WindowStatistics, speed: float
+) -> dict[str, FloatArray]:
+    """Noise parameters of every sensor: its measured density less the response to the excitation."""
+    groups, point = model.groups, model.at(theta, speed)
+    dofs = [_dof(state) for state in window.states]
+    seen = point.H[:, :, dofs]
+    power = np.einsum("gksa,ab,gksb->gks", seen, point.C, seen.conj(), optimize=True).real
+    gain = low_pass(groups.nodes_hz, *model.filter(theta)) * groups.weights
+    w = 2 * np.pi * groups.nodes_hz
+    averages = AVERAGES_PER_BIN * window.n_segments * groups.bins
+    shape = _colour(groups.centre_hz, machine.window.band_hz[1])
+    measured = np.einsum("gss->gs", groups.average(window.spectrum)).real
+    found = {}
+    for at, state in enumerate(window.states):
+        theory = np.sum(gain * w ** (2 * _order(state)) * power[:, :, at], axis=1)
+        found[state] = _sensor_noise(measured[:, at], theory, averages, shape)
+    return found
+
+
+def _dof(state: str) -> int:
+    return COORDINATES.index(state.partition("_")[0])
+
+
+def _order(state: str) -> int:
+    """Number of time derivatives of the coordinate in a state."""
+    return {"": 0, "dot": 1, "ddot": 2}[state.partition("_")[2]]
+
+
+_NOISE_STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
+_MOST_NOISE_SLOPE = 4.0
+_LEAST, _USUAL = 1e-7, 1e-3
+"""Noise density over the channel's mean density: lower bound of the search, and starting point."""
+_NOISE_PRIOR_PRECISION = np.array([0.05, 1.0])
+"""Prior precision of ln d₀ and b about their usual values: weak, for sensors whose noise is not visible."""
+
+
+def _noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
+    """Noise density d(f) of a sensor with parameters ln d₀ and b, in a band that ends at `high_hz`, SI²/Hz."""
+    return np.asarray(np.exp(parameters[0] + parameters[1] * _colour(frequencies_hz, high_hz)), dtype=np.float64)
+
+
+def _colour(frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
+    return np.asarray(np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2), dtype=np.float64)
+
+
+def _sensor_noise(measured: FloatArray, theory: FloatArray, averages: FloatArray, shape: FloatArray) -> FloatArray:
+    """Estimate ln d₀ and b of one sensor's noise, shape (2,).
+
+    `measured` are densities, each the mean of `averages` independent estimates; `theory` are those without noise, both
+    SI²/Hz. `shape` is `_colour` at their frequencies. All have shape (n_groups,).
+    """
+    level = float(np.log(averages @ measured / averages.sum()))
+    usual = np.array([level + np.log(_USUAL), 0.0])
+
+    def seen(point: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Noise density, expected density, and the log-likelihood plus log-prior."""
+        noise = np.exp(point[0] + point[1] * shape)
+        expected = theory + noise
+        fits = -float(averages @ (np.log(expected) + measured / expected))
+        return noise, expected, fits - float(_NOISE_PRIOR_PRECISION @ (point - usual) ** 2) / 2
+
+    found, damping = usual, 1e-3
+    noise, expected, value = seen(found)
+    for _ in range(_NOISE_STEPS):
+        slopes = np.stack([noise / expected, shape * noise / expected])
+        gradient = slopes @ (averages * (measured / expected - 1)) - _NOISE_PRIOR_PRECISION * (found - usual)
+        information = (slopes * averages) @ slopes.T + np.diag(_NOISE_PRIOR_PRECISION)
+        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        step = np.clip(step, -_LONGEST, _LONGEST)
+        trial = np.clip(found + step, (level + np.log(_LEAST), -_MOST_NOISE_SLOPE), (level, _MOST_NOISE_SLOPE))
+        there = seen(trial)
+        if there[2] > value:
+            found, (noise, expected, value), damping = trial, there, damping / 8
+            if np.all(np.abs(step) < _CLOSE):
+                break
+        else:
+            damping *= 8
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,32 +238,17 @@ class Prediction:
     nominal_reason: str
     estimated_reason: str
 
-    @property
-    def nominal(self) -> RotorParameters | None:
-        """The nominal rotor, or None if there is no prediction for it."""
-        return None if self.machine is None or self.nominal_reason else self.machine.rotor
-
-    @property
-    def estimated(self) -> RotorParameters | None:
-        """The rotor as estimated, or None if there is no prediction for it."""
-        if self.machine is None or self.estimated_reason:
-            return None
-        return changed(self.machine.rotor, self.changes)
+    def rotors(self, known: Machine) -> tuple[RotorParameters | None, RotorParameters | None]:
+        """The nominal rotor and that as estimated, each None if there is no prediction for it."""
+        estimated = None if self.estimated_reason else changed(known.rotor, self.changes)
+        return None if self.nominal_reason else known.rotor, estimated
 
     def spectra(
         self, states: tuple[str, ...], frequencies_hz: FloatArray
     ) -> tuple[ComplexArray | None, ComplexArray | None]:
-        """Expected cross-spectra of the segments, two-sided, SI²/Hz, shape (n_lines, n, n).
+        """Expected cross-spectra of the segments, two-sided, SI²/Hz, nominal and estimated; None without a prediction.
 
-        Parameters
-        ----------
-        frequencies_hz : ndarray, shape (n_lines,)
-            Lines of the window's spectrum, evenly spaced.
-
-        Returns
-        -------
-        nominal, estimated : ndarray or None
-            None if there is no prediction.
+        The frequencies are lines of the window's spectrum, evenly spaced; the shape is (n_lines, n, n).
         """
         if self.excitation is None or self.machine is None:
             return None, None
@@ -80,7 +257,7 @@ class Prediction:
         lines = group_bins(frequencies_hz, self.machine, none_left_out, spacing_hz)
         nodes, place = np.unique(np.round(lines.nodes_hz / spacing_hz, 6), return_inverse=True)
         found: list[ComplexArray | None] = []
-        for rotor in (self.nominal, self.estimated):
+        for rotor in self.rotors(self.machine):
             if rotor is None:
                 found.append(None)
                 continue
@@ -103,7 +280,7 @@ class Prediction:
             return None, None
         low_hz, high_hz = within_hz or (0.0, _highest_hz(self.machine, states))
         found: list[FloatArray | None] = []
-        for rotor in (self.nominal, self.estimated):
+        for rotor in self.rotors(self.machine):
             if rotor is None:
                 found.append(None)
                 continue
@@ -141,10 +318,8 @@ def _nodes(
         even.append(min(at, high_hz))
     edges = np.unique(np.concatenate([even, around[(around > low_hz) & (around < high_hz)]]))
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
-    return (
-        np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel()),
-        np.asarray((half[:, None] * _WEIGHTS).ravel()),
-    )
+    frequencies_hz = np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel())
+    return frequencies_hz, np.asarray((half[:, None] * _WEIGHTS).ravel())
 
 
 def predict(

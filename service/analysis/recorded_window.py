@@ -11,13 +11,13 @@ from models.diagnosis.window.sliding import SlidingWindow
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
-from models.signals.channels import Channel, ChannelDescriptor, state_name
+from models.signals.channels import Channel, state_name
 from rotorwatch.records.health import Report
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 from service.analysis.recorded import Recorded
 from service.analysis.revolutions import Excerpt
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.recordings.replay.source import RecordingSource
 
 _LEAD_S = 10.0
@@ -35,16 +35,12 @@ def recorded_window(
     *,
     lagged: bool,
 ) -> LatestData:
-    """Rebuild the window of a recording that ends at a given time.
+    """Rebuild the window of a recording that ends at a given time, or at the end of the recording.
 
     Parameters
     ----------
-    machine : MachineFile
-        Machine file with which the window is evaluated.
     recorded : str
         ``SITE/MACHINE`` under which the samples were recorded.
-    until_ns : int or None
-        End of the window; None is the end of the recording.
     report : Report or None
         The report on this window: the window then has exactly its samples, and theory uses its readings.
     lagged : bool
@@ -61,10 +57,15 @@ def recorded_window(
     first_ns = _first_ns(plan, end_ns, report)
     begin_ns = max(0, first_ns - round(_LEAD_S * 1e9))
     data = Recorded(source, keys, *source.between(f"{begin_ns}ns", f"{end_ns}ns", keys))
-    _check(data.descriptor, machine, data.place)
+    channels, expected = data.descriptor.channels, machine.descriptor
+    if channels != expected.channels or data.descriptor.rate_hz != expected.rate_hz:
+        raise RotorwatchError(
+            f"{machine.title}: {data.place} was recorded with {', '.join(one.name for one in channels)} "
+            f"at {data.descriptor.rate_hz:g} Hz, or other units; expected those of the machine file, "
+            f"{', '.join(one.name for one in expected.channels)} at {expected.rate_hz:g} Hz"
+        )
     window = SlidingWindow(plan)
     newest: Excerpt | None = None
-    channels = data.descriptor.channels
     lost = LatestData(sensors=() if report is None else report.sensors).missing
     sent = [one for one in data.sent(channels) if state_name(one) not in lost]
     for stretch in data.stretches(sent):
@@ -106,13 +107,3 @@ def _block(stretch: Excerpt) -> SampleBlock:
 
 def _missing(channel: Channel) -> SensorFault:
     return SensorFault(states=(state_name(channel),), kind=FaultKind.MISSING, text=no_data([channel.name]), value=None)
-
-
-def _check(found: ChannelDescriptor, machine: MachineFile, place: str) -> None:
-    expected = machine.descriptor
-    if found.channels != expected.channels or found.rate_hz != expected.rate_hz:
-        raise RotorwatchError(
-            f"{machine.title}: {place} was recorded with {', '.join(one.name for one in found.channels)} "
-            f"at {found.rate_hz:g} Hz, or other units; expected those of the machine file, "
-            f"{', '.join(one.name for one in expected.channels)} at {expected.rate_hz:g} Hz"
-        )

@@ -60,7 +60,6 @@ def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp
             f"{', '.join(one.name for one in channels)}: phases need a keyphasor, and are kept of 1x and 2x"
         )
     vectors = np.array([row for _, _, row in found], dtype=np.float64)
-    shown = [unit_shown(channel) for channel in channels]
     return RunUp(
         channels=channels,
         units=tuple(shown_as(channel, "amplitude")[0] for channel in channels),
@@ -68,7 +67,7 @@ def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp
         revolutions=None,
         time_ns=np.array([end_ns for end_ns, _, _ in found], dtype=np.int64),
         speed_rad_s=np.array([speed for _, speed, _ in found]),
-        amplitude=vectors[:, :, 0] * np.array([factor for _, factor in shown]),
+        amplitude=vectors[:, :, 0] * np.array([unit_shown(channel)[1] for channel in channels]),
         lag_deg=vectors[:, :, 1],
         slow_roll_rpm=None,
         estimated=False,
@@ -174,9 +173,8 @@ def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Ce
     start, end, speed, means_ = zip(*rows, strict=True)
     middle_ns = (np.array(start, dtype=np.int64) + np.array(end, dtype=np.int64)) // 2
     y_um, z_um = in_planes(np.array(means_, dtype=np.float64), pairs)
-    return Centreline(
-        tuple(pairs), (end[-1] - start[-1]) / 1e9, middle_ns, np.array(speed, dtype=np.float64), y_um, z_um
-    )
+    each_s, speed_rad_s = (end[-1] - start[-1]) / 1e9, np.array(speed, dtype=np.float64)
+    return Centreline(tuple(pairs), each_s, middle_ns, speed_rad_s, y_um, z_um)
 
 
 def read_centreline(data: Sampled | Past, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:

@@ -1,4 +1,8 @@
-"""Spectra of samples: of the latest seconds, and over time or speed."""
+"""Spectra of samples: of the latest seconds, and over time or speed.
+
+Segments never reach across a gap. `MachineFileError` is raised if the window is shorter than one segment, which is
+1 / `resolution_hz` long, and `RotorwatchError` if too few stretches without a gap hold one.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -164,15 +168,7 @@ def steady(speed_rad_s: FloatArray) -> str:
 def read_spectrum(
     data: Sampled, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Spectrum:
-    """Spectra of the latest `window_s` of a recorded stream; segments never reach across a gap.
-
-    Raises
-    ------
-    MachineFileError
-        If the window is shorter than one segment, which is 1 / `resolution_hz` long.
-    RotorwatchError
-        If no stretch without a gap holds a segment.
-    """
+    """Spectra of the latest `window_s` of a recorded stream."""
     segment = _segment(data, window_s, resolution_hz)
     used, speed_rad_s = _used(data, channels, window_s, segment)
     rate_hz = data.descriptor.rate_hz
@@ -209,19 +205,12 @@ def _used(data: Sampled, channels: Sequence[Channel], window_s: float, segment: 
 def read_full_spectrum(
     data: Sampled, pairs: Sequence[tuple[Channel, Channel]], window_s: float, resolution_hz: float, *, orders: bool
 ) -> FullSpectrum:
-    """Full spectra of the latest `window_s` that were recorded; segments never reach across a gap.
+    """Full spectra of the latest `window_s` that were recorded.
 
     Parameters
     ----------
     orders : bool
         Order spectrum: samples are resampled at equal shaft angles, so that a changing speed does not smear the lines.
-
-    Raises
-    ------
-    MachineFileError
-        If the window is shorter than one segment, or `orders` are asked for without a shaft angle.
-    RotorwatchError
-        If no stretch without a gap holds a segment, or the shaft does not turn.
     """
     if orders and not data.has_angle:
         raise MachineFileError(f"{data.place}: --axis orders needs the shaft angle (keyphasor), which is not measured")
@@ -268,15 +257,7 @@ def _at_equal_angles(stretch: Excerpt, each: int) -> Excerpt:
 def read_waterfall(
     data: Sampled, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Waterfall:
-    """Spectra of one channel, one per window of `window_s`; in long recordings windows are longer.
-
-    Raises
-    ------
-    MachineFileError
-        If the window is shorter than one segment, which is 1 / `resolution_hz` long.
-    RotorwatchError
-        If fewer than two stretches without a gap hold a segment.
-    """
+    """Spectra of one channel, one per window of `window_s`; in long recordings windows are longer."""
     segment = _segment(data, window_s, resolution_hz)
     each_s = max(window_s, (data.to_ns - data.from_ns) / 1e9 / _MOST_SPECTRA)
     rows: list[tuple[int, int, float, FloatArray]] = []

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,13 +69,7 @@ class TrendSeries:
 
 
 def past_trend(data: Past, *, levels: bool = False) -> TrendSeries:
-    """The trend of the reports in the history.
-
-    Raises
-    ------
-    RotorwatchError
-        If nothing was read in any report.
-    """
+    """The trend of the reports in the history."""
     alarms = _shown_alarms(data.alarm_texts)
     return trend_of([_slim(one) for one in data.reports], alarms, data.machine.alarms, "of the history", levels=levels)
 
@@ -114,12 +109,10 @@ def recorded_alarms(data: Recorded) -> tuple[AlarmEventData, ...]:
 def _shown_alarms(texts: Iterable[str | bytes]) -> tuple[AlarmEventData, ...]:
     found: dict[str, AlarmEventData] = {}
     for text in texts:
-        try:
+        with suppress(ValidationError):
             event = AlarmCloudEvent.model_validate_json(text)
-        except ValidationError:
-            continue
-        if event.data.kind in SHOWN:
-            found[event.id] = event.data
+            if event.data.kind in SHOWN:
+                found[event.id] = event.data
     return tuple(sorted(found.values(), key=lambda data: data.time_ns))
 
 

@@ -16,8 +16,7 @@ from models.mistakes import form
 from rotorwatch.records.replays import ReplayJob
 from service.analysis.recorded import Held, Recorded, Sampled
 from service.analysis.recorded_window import recorded_window
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.api.routes.recordings import found_recording
 from service.api.views import ServiceView, time_query
 from service.monitor.evaluators import evaluator_for

@@ -29,7 +29,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
-from types import FrameType
 from typing import IO
 
 import httpx
@@ -44,6 +43,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Report
 from service.stream.transport import TopicMessage, follow
 from service.terminal.lines import alarm_event_line, report_heading, report_row, with_minus_signs
+from service.terminal.stopping import handled
 
 FAULTS = {"k_by": -0.25, "c_by": -0.30, "k_bz": -0.25, "c_bz": -0.30, "e": 0.30}
 """Faults as relative changes of parameters; the simulator's scenarios of these names apply the same changes."""
@@ -96,18 +96,6 @@ class Truth(BaseModel, extra="ignore", frozen=True):
     relative_changes: dict[str, float]
 
 
-@dataclass(frozen=True, slots=True)
-class DemoOptions:
-    """Options of the demo."""
-
-    fault: str  # first fault, one of `FAULTS`, or "none"
-    seed: int  # of the simulation; training used no small seeds
-    pace: float  # data seconds per second
-    once: bool  # end after the first fault, or after the same time without a fault
-    # 0 takes free ports, for Zenoh too; None takes the usual ports if they are free.
-    http_port: int | None = None
-
-
 @dataclass(slots=True)
 class Outcome:
     """Faults injected in one round, and alarms raised."""
@@ -150,10 +138,11 @@ class Outcome:
         return with_minus_signs("injected {}; named {}; {}".format(*sides, rest))
 
 
-def run_demo(options: DemoOptions) -> int:
-    """Run the demo for one fault (`once`) or until interrupted.
+def run_demo(fault: str, seed: int, pace: float, once: bool, http_port: int | None) -> int:
+    """Run the demo for one fault (`once`) or until interrupted; `fault` is one of `FAULTS`, or "none".
 
-    The exit code is 0 if exactly the injected parameter was named, 1 if not, and 130 if interrupted.
+    Port 0 takes free ports, for Zenoh too; None takes the usual ports if they are free. The exit code is 0 if exactly
+    the injected parameter was named, 1 if not, and 130 if interrupted.
 
     Raises
     ------
@@ -163,9 +152,10 @@ def run_demo(options: DemoOptions) -> int:
     console = Console(highlight=False)
     console.width = min(console.width, _WIDTH) if console.is_terminal else _WIDTH
     with ExitStack() as stack:
-        stack.enter_context(_interruptible())
+        # A termination signal is treated like Ctrl-C, so that the programs are stopped in order.
+        stack.enter_context(handled((signal.SIGTERM, signal.SIGHUP), signal.default_int_handler))
         try:
-            passed = _Show(options, console).run(stack)
+            passed = _Show(fault, seed, pace, once, http_port, console).run(stack)
         except KeyboardInterrupt:
             console.print("\nstopping simulator and monitor ...")
             stack.close()
@@ -177,18 +167,17 @@ def run_demo(options: DemoOptions) -> int:
 class _Show:
     """Runs the two programs, and prints their messages."""
 
-    def __init__(self, options: DemoOptions, console: Console) -> None:
-        self._options, self._console = options, console
+    def __init__(self, fault: str, seed: int, pace: float, once: bool, http_port: int | None, console: Console) -> None:
+        self._seed, self._pace, self._once, self._console = seed, pace, once, console
         self._machine: Machine = load_machine("lab")
-        free = options.http_port == 0
-        zenoh_port, http_port = (_port(None if free else usual) for usual in _PORTS)
+        zenoh_port, free_port = (_port(None if http_port == 0 else usual) for usual in _PORTS)
         self._endpoint = f"tcp/127.0.0.1:{zenoh_port}"
-        self._url = f"http://127.0.0.1:{options.http_port or http_port}"
+        self._url = f"http://127.0.0.1:{http_port or free_port}"
         self._base = f"{self._url}/api/v1/machines/{self._machine.title}"
         names = list(FAULTS)
-        first = names.index(options.fault) if options.fault in FAULTS else 0
+        first = names.index(fault) if fault in FAULTS else 0
         self._rounds = [
-            (name if options.fault in FAULTS else None, _HEALTHY_S + number * (_BROKEN_S + _REPAIRED_S))
+            (name if fault in FAULTS else None, _HEALTHY_S + number * (_BROKEN_S + _REPAIRED_S))
             for number, name in enumerate(islice(cycle(names[first:] + names[:first]), _ROUNDS))
         ]
         self._round = 0
@@ -211,7 +200,7 @@ class _Show:
         simulator = stack.enter_context(
             _program(
                 "simulator", "simulator.rotorsim", "publish", "healthy", "--connect", self._endpoint,
-                "--seed", str(self._options.seed), "--pace", f"{self._options.pace:g}",
+                "--seed", str(self._seed), "--pace", f"{self._pace:g}",
                 "--duration", f"{self._rounds[-1][1] + _BROKEN_S + _REPAIRED_S:g}", *self._injections(),
                 "--wait-for-subscriber", f"{_START_S:g}", "--linger", "0",
             )
@@ -244,7 +233,7 @@ class _Show:
         ]
 
     def _introduce(self) -> None:
-        pace, window_s = self._options.pace, self._machine.window.length_s
+        pace, window_s = self._pace, self._machine.window.length_s
         what = (
             f"After {_HEALTHY_S:g} s of data the simulator damages the rotor; the monitor does not "
             "know, and has to find out what changed and by how much."
@@ -254,7 +243,7 @@ class _Show:
         program = _command()
         self._console.print(
             f"[bold]rotorwatch demo[/]: a simulated rotor publishes its vibration {pace:g} times faster than real "
-            f"time (seed {self._options.seed}); a monitor listens. {what}\n\n"
+            f"time (seed {self._seed}); a monitor listens. {what}\n\n"
             f"  page   [bold]{self._url}[/]\n"
             f"  API    {self._base}/health\n"
             f"  Zenoh  {self._endpoint}\n\n"
@@ -315,7 +304,7 @@ class _Show:
             self._console.print(f"[bold red]demo failed:[/] {with_minus_signs(reason)}")
         else:
             self._console.print(f"[bold green]demo passed:[/] {self._outcome.line()}")
-        if self._options.once:
+        if self._once:
             return reason
         self._outcome = Outcome()
         self._round += 1
@@ -381,22 +370,6 @@ def _wait_until_ready(url: str, monitor: _Program) -> None:
                 pass
             time.sleep(0.1)
     raise RotorwatchError(f"the monitor was not ready after {_START_S:g} s")
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Treat a termination signal like Ctrl-C, so that the programs are stopped in order."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        del signum, frame
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _command() -> str:

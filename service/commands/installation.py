@@ -154,7 +154,7 @@ def _schedule(given: str) -> dict[str, str]:
 
 def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
     """Text of a machine file with the known fields, and a hint at the limits of levels."""
-    lines = [f"{key} = {json.dumps(value)}" for key, value in (("site", machine.site), ("name", machine.name))]
+    lines = [f"site = {json.dumps(machine.site)}", f"name = {json.dumps(machine.name)}"]
     lines += [f"rate_hz = {machine.rate_hz}", f'dtype = "{machine.dtype}"']
     if speed_rpm is not None:
         lines += ["", "[operation]", f"speed_rpm = {float(speed_rpm)}"]

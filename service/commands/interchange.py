@@ -96,15 +96,12 @@ def export(
     from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
     from service.interchange.exporting import export as write  # noqa: PLC0415
 
-    selection = Selection(
-        tuple(recordings), machine, _nanoseconds("--from", from_), _nanoseconds("--to-time", to_time), si
-    )
-    table = write(selection, what, to, out, overwrite=overwrite)
+    from_ns, to_ns = _nanoseconds("--from", from_), _nanoseconds("--to-time", to_time)
+    table = write(Selection(tuple(recordings), machine, from_ns, to_ns, si), what, to, out, overwrite=overwrite)
     typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
-    for text in table.skipped[:_LISTED]:
+    more = [f"{len(table.skipped) - _LISTED} more"] if len(table.skipped) > _LISTED else []
+    for text in table.skipped[:_LISTED] + more:
         typer.echo(f"left out: {text}", err=True)
-    if len(table.skipped) > _LISTED:
-        typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
 
 
 def _nanoseconds(option: str, text: str | None) -> int | None:

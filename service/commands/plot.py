@@ -136,10 +136,10 @@ class _Picture:
 
     def known(self, *, reports: bool = False) -> "Recorded | Past":
         """The recorded data to be drawn, or those of the history."""
-        if self.history is None or self.files:
-            if self.history is not None:
-                raise MachineFileError("both recordings and --history are given, expected one of them")
+        if self.history is None:
             return self.recorded(reports=reports)
+        if self.files:
+            raise MachineFileError("both recordings and --history are given, expected one of them")
         from service.analysis.past import Past  # noqa: PLC0415
 
         return Past.find(self.history, self.key, (self.from_, self.to))
@@ -225,7 +225,7 @@ def orbit(
     revolutions: Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many.")] = 8,
 ) -> "Paint":
     """The shaft's path at bearing and disc, as measured and at running speed alone."""
-    from service.analysis.figures.orbit import orbit as read  # noqa: PLC0415
+    from service.analysis.figures.samples import orbit as read  # noqa: PLC0415
 
     return read(picture.recorded(at), revolutions)
 
@@ -288,7 +288,7 @@ def waveform(
     ] = None,
 ) -> "Paint":
     """Samples of channels over time, with the keyphasor's pulses."""
-    from service.analysis.figures.waveform import waveform as read  # noqa: PLC0415
+    from service.analysis.figures.samples import waveform as read  # noqa: PLC0415
 
     _positive("--window", window)
     return read(picture.recorded(at), channel or (), window)

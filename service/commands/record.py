@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -17,7 +18,6 @@ from service.commands.running import ConnectOption, LinkOption, ListenOption, ex
 
 if TYPE_CHECKING:  # these import numpy, which would delay --help
     from models.machine import MachineFile
-    from models.signals.salvage import Salvage
     from service.recordings.recorder import MachineRecorder
     from service.settings.service import HistorySettings, RecordingSettings
 
@@ -73,10 +73,9 @@ def record(
     """
     with ExitStack() as undo:
         prepare_numerics()
-        changes = {"rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
-        machines, settings, history = _settings(
-            config, machine, out, {k: v for k, v in changes.items() if v is not None}
-        )
+        directory = None if out is None else str(out)
+        changes = {"directory": directory, "rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
+        machines, settings, history = _settings(config, machine, changes)
         from service.history.shared import committed_events  # noqa: PLC0415  # keeps --help quick
         from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
         from service.settings.service import LogSettings  # noqa: PLC0415
@@ -159,7 +158,7 @@ def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> 
 
 
 def _settings(
-    config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
+    config: Path | None, machines: list[str] | None, changes: Mapping[str, str | float | None]
 ) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings]":
     """Machines, recording and history settings; the command line overrides the settings file."""
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
@@ -169,10 +168,8 @@ def _settings(
     settings = load_settings(config)
     if not machines and config is None:
         raise MachineFileError("nothing to record: give --machine FILE, or --config FILE with machines in it")
-    fields = settings.recording.model_dump()
-    if out is not None:
-        fields["directory"] = str(out)
-    recording = checked(RecordingSettings, fields | changes, "command line")
+    fields = settings.recording.model_dump() | {name: one for name, one in changes.items() if one is not None}
+    recording = checked(RecordingSettings, fields, "command line")
     if recording.directory is None:
         raise MachineFileError("nowhere to record to: give --out DIR, or directory in [recording] of the settings")
     files = machines or [entry.file for entry in settings.machines]
@@ -213,14 +210,10 @@ def _recover(file: Path, out: Path | None) -> None:
     target = out or own_name
     salvage = salvage_recording(file, target)
     typer.echo(f"{file}: {salvage.count} messages recovered into {target}")
-    for line in _contents(salvage):
-        typer.echo(f"  {line}")
-    typer.echo(f"  {loss_text(salvage)}")
-
-
-def _contents(salvage: "Salvage") -> list[str]:
     width = max(map(len, salvage.messages), default=0)
-    lines = [f"{key:<{width}} {count:>9} messages" for key, count in sorted(salvage.messages.items())]
+    for key, count in sorted(salvage.messages.items()):
+        typer.echo(f"  {key:<{width}} {count:>9} messages")
     begin, end = (datetime.fromtimestamp(t * 1e-9, UTC) for t in (salvage.start_ns, salvage.end_ns))
     span_s = (salvage.end_ns - salvage.start_ns) * 1e-9
-    return [*lines, f"from {begin:%Y-%m-%d %H:%M:%S.%f} to {end:%Y-%m-%d %H:%M:%S.%f} UTC ({span_s:.3f} s)"]
+    typer.echo(f"  from {begin:%Y-%m-%d %H:%M:%S.%f} to {end:%Y-%m-%d %H:%M:%S.%f} UTC ({span_s:.3f} s)")
+    typer.echo(f"  {loss_text(salvage)}")

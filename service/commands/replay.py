@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which would delay
     from service.recordings.replay.source import RecordingSource
     from service.runtime.archive import MachineTask
     from service.stream.replay_link import NetworkPlan
-    from service.terminal.stopping import StopRequest
 
 commands = typer.Typer()
 _SLOWEST, _FASTEST = 0.1, 1000.0
@@ -184,10 +183,8 @@ def replay(
             for change in set_ or ():
                 if "=" not in change:
                     raise MachineFileError(f"--set {change!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
-            changes = "\n".join(set_ or ())
-            chosen = (source.machine(key),) if ray is None else machines
-            tasks = []
-            for one in chosen:
+            changes, tasks = "\n".join(set_ or ()), []
+            for one in (source.machine(key),) if ray is None else machines:
                 recorded = source.paths_between(from_ns, to_ns, frozenset({one.stream}))
                 tasks.append(MachineTask(f"{one.site}/{one.machine}", recorded, wanted(one), changes, from_ns, to_ns))
             if ray is None:
@@ -267,11 +264,9 @@ def _evaluate_all(
     typer.echo(f"{len(tasks)} machines in {len(source.paths)} recordings ...", err=True)
     for done, (summary, text) in enumerate(on_cluster(ray, tasks), start=1):
         file, data_s = _file_of(folder, f"{summary.site}/{summary.machine}"), data_s + summary.data_s
-        try:
+        with _report_write_errors(file):
             folder.mkdir(parents=True, exist_ok=True)
             file.write_text(text, encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise MachineFileError(f"{file}: cannot be written ({error.strerror or error})") from error
         raised = f", raised at the end: {', '.join(summary.raised)}" if summary.raised else ""
         typer.echo(
             f"{done:4d} of {len(tasks)}  {summary.site}/{summary.machine}: {summary.data_s:.0f} s of data, "
@@ -304,25 +299,22 @@ def _machines_of(config: Path | None, machine: str | None) -> "Callable[[Machine
     return named
 
 
-def summary_lines(summary: "OfflineSummary") -> list[str]:
+def summary_lines(summary: "OfflineSummary") -> Iterator[str]:
     """Describe the result of an offline replay in lines of text."""
     refused = ", ".join(f"{count} {reason}" for reason, count in summary.refused_blocks.items())
-    lines = [
-        f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}",
-        f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: "
-        f"{', '.join(summary.raised) or 'none'}",
-        f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time",
-        f"{summary.blocks} blocks accepted, refused: {refused or 'none'}"
-        + (f"; latest reason: {summary.last_refusal}" if refused else ""),
-    ]
+    raised = ", ".join(summary.raised) or "none"
+    latest = f"; latest reason: {summary.last_refusal}" if refused else ""
+    yield f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}"
+    yield f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: {raised}"
+    yield f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time"
+    yield f"{summary.blocks} blocks accepted, refused: {refused or 'none'}{latest}"
     if summary.skipped_windows:
-        lines.append(f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up")
+        yield f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up"
     if summary.gaps:
-        lines.append(f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing")
+        yield f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing"
     if summary.stopped:
-        lines.append("stopped before the end")
-    lines.append(f"SHA-256 of the lines {summary.sha256}")
-    return lines
+        yield "stopped before the end"
+    yield f"SHA-256 of the lines {summary.sha256}"
 
 
 @contextmanager
@@ -367,21 +359,17 @@ def _stoppable(control: "Control") -> Iterator[None]:
     """Stop the replay cleanly on SIGINT and SIGTERM."""
     from service.terminal.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
 
-    over = threading.Event()
-
-    def watch(stop: "StopRequest") -> None:
-        while not over.is_set():
-            if stop.wait(0.25):
-                control.stop()
-                return
+    def watch() -> None:
+        stop.wait()
+        control.stop()
 
     with stop_request() as stop:
-        thread = threading.Thread(target=watch, args=(stop,), name="signals", daemon=True)
+        thread = threading.Thread(target=watch, name="signals", daemon=True)
         thread.start()
         try:
             yield
         finally:
-            over.set()
+            stop.ask()  # ends the thread; the replay is over
             thread.join()
 
 
@@ -428,14 +416,21 @@ def _check_prefix(option: str, prefix: str) -> None:
         )
 
 
-def link_of(connect: list[str] | None, listen: list[str] | None, link: Path | None = None) -> "LinkSettings":
-    """Link settings from the command line or a file; endpoints on the command line replace the file's and its role."""
+def link_of(
+    connect: list[str] | None,
+    listen: list[str] | None,
+    link: Path | None = None,
+    settings: "LinkSettings | None" = None,
+) -> "LinkSettings":
+    """Link settings of a file, or else `settings`; endpoints on the command line replace all of them and the role."""
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
     from models.signals.link import LinkSettings, load_link  # noqa: PLC0415
 
+    # A router forwards between clients, but not between peers, which it assumes to be connected to each other.
     ends = {"mode": "peer" if listen else "client", "listen": tuple(listen or ()), "connect": tuple(connect or ())}
-    if link is not None:
-        return load_link(link).model_copy(update=ends if listen or connect else {})
+    base = settings if link is None else load_link(link)
+    if base is not None:
+        return base.model_copy(update=ends if listen or connect else {})
     return checked(LinkSettings, ends if listen or connect else ends | {"connect": (ENDPOINT,)}, "command line")
 
 

@@ -1,4 +1,4 @@
-"""The command ``rotorwatch``: monitoring, router, demo and check of settings; for others see `service.commands`."""
+"""The command ``rotorwatch``: monitoring, router, webhooks, demo and check of settings; see also `service.commands`."""
 
 import socket
 import sys
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from models.errors import RotorwatchError
-from service.commands import access, history, installation, interchange, plot, record, replay, size, watching, webhook
-from service.commands.replay import NamespaceOption, in_namespace
+from models.errors import MachineFileError, RotorwatchError
+from service.commands import access, history, installation, interchange, plot, record, replay, size, watching
+from service.commands.replay import NamespaceOption, in_namespace, link_of
 from service.commands.running import (
     ENDPOINT,
     Commands,
@@ -37,6 +37,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 success, 1 error at run time, 2 unusable file or argument; of status also 3 no "
     "data, 4 no answer.",
 )
+webhooks = typer.Typer(name="webhook", no_args_is_help=True, help="Programs that receive alarm events.")
 
 
 @app.callback()
@@ -89,7 +90,6 @@ def run(
     """
     _prepare()
     from models.mistakes import checked  # noqa: PLC0415  # keeps --help quick
-    from models.signals.link import load_link  # noqa: PLC0415
     from service.settings.service import MachineEntry, check_distinct, load_settings  # noqa: PLC0415
 
     settings = load_settings(config)
@@ -98,12 +98,6 @@ def run(
         pairs = [text.partition("@") for text in machine]
         named = [{"file": file, "bundle": bundle or None} for file, _, bundle in pairs]
         update["machines"] = tuple(checked(MachineEntry, one, "--machine") for one in named)
-    # Endpoints and role on the command line replace all those of the settings.
-    ends = settings.link if link is None else load_link(link)
-    if listen or connect:
-        # A router forwards between clients, but not between peers, which it assumes to be connected to each other.
-        mode = "peer" if listen else "client"
-        ends = ends.model_copy(update={"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())})
     if namespace is not None:
         # Replayed data must not enter the recordings and the history of the live machine.
         update["recording"] = settings.recording.model_copy(update={"directory": None})
@@ -112,7 +106,8 @@ def run(
         update["http"] = settings.http.model_copy(update={"port": http_port})
     if when_full is not None:
         update["queue"] = settings.queue.model_copy(update={"when_full": when_full})
-    settings = settings.model_copy(update=update | {"link": in_namespace(ends, namespace)})
+    update["link"] = in_namespace(link_of(connect, listen, link, settings.link), namespace)
+    settings = settings.model_copy(update=update)
     check_distinct(Path("command line"), settings)
     settings.link.check_reach("command line")
     _serve(settings, config)
@@ -242,6 +237,42 @@ def router(
         stop.wait()
 
 
+@webhooks.command()
+def secret() -> None:
+    """Create a secret for signing events; the receiver needs the same one.
+
+    [bold]Example[/bold]
+
+    [cyan](umask 077; rotorwatch webhook secret > pager.secret)[/cyan]
+    """
+    from service.delivery.webhooks.signature import new_secret  # noqa: PLC0415  # keeps --help quick
+
+    typer.echo(new_secret())
+
+
+@webhooks.command("test")
+def test_webhook(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the webhook in the settings.")],
+    config: Annotated[Path, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor.")],
+) -> None:
+    """Send a test event, which is not an alarm, and report whether the receiver accepts it; exit code 1 if not.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
+    """
+    from service.delivery.webhooks.webhooks import send_test  # noqa: PLC0415
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+
+    webhooks = load_settings(config).webhooks
+    settings = next((webhook for webhook in webhooks if webhook.name == name), None)
+    if settings is None:
+        there = ", ".join(webhook.name for webhook in webhooks) or "none"
+        raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
+    took_s = send_test(settings)
+    typer.echo(f"{name}: {settings.target} accepted the test event, in {took_s:.2f} s")
+
+
 @app.command()
 def demo(
     fault: Annotated[
@@ -278,10 +309,9 @@ def demo(
     prepare_numerics()
     typer.echo("starting a simulated machine and a monitor (some seconds) ...")
     sys.stdout.flush()
-    from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
+    from service.commands.demo import run_demo  # noqa: PLC0415  # keeps --help quick
 
-    code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
-    raise typer.Exit(code)
+    raise typer.Exit(run_demo(fault, seed, pace, once, http_port))
 
 
 def _checked(file: Path) -> str:
@@ -327,5 +357,5 @@ def _not_listening(host: str) -> str:
 # Added last, so that the commands of this module come first in the list.
 for module in (installation, size, watching, access, record, replay, interchange):
     app.add_typer(module.commands)
-for group in (access.tokens, webhook.commands, history.commands, plot.commands):
+for group in (access.tokens, webhooks, history.commands, plot.commands):
     app.add_typer(group)

@@ -72,11 +72,15 @@ def watch(
     base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
     ends = {"connect": tuple(connect)} if connect else {}
     settings = in_namespace(base.model_copy(update=ends), namespace)
-    say = _show_json if as_json else _Lines()
+    lines = _Lines()
 
     def show(message: "TopicMessage") -> None:
         try:
-            say(message)
+            if as_json:
+                sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
+            else:
+                lines.show(message)
+            sys.stdout.flush()
         except (BrokenPipeError, SystemExit):  # the reader has closed the pipe; rich turns the error into SystemExit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             stop.ask()
@@ -186,36 +190,29 @@ class _Lines:
         self._states: dict[str, str] = {}
         self._alarms: set[str] = set()
 
-    def __call__(self, message: "TopicMessage") -> None:
+    def show(self, message: "TopicMessage") -> None:
+        """Show a message, if there is anything new in it."""
         from rotorwatch import AlarmCloudEvent, AlarmStates, Health, Report  # noqa: PLC0415  # keeps --help quick
         from service.terminal import lines  # noqa: PLC0415
 
         if message.key.endswith("/alarm/event"):
             event = AlarmCloudEvent.model_validate_json(message.text)
             style = _STYLES[event.data.severity] if event.data.kind in {"raised", "escalated"} else "green"
-            self._say(lines.alarm_event_line(event), style)
+            self._console.print(lines.alarm_event_line(event), style=style)
         elif message.key.endswith("/alarm/state"):
             if message.key not in self._alarms:  # later changes arrive as events
                 self._alarms.add(message.key)
                 for line in lines.alarm_state_lines(AlarmStates.model_validate_json(message.text)):
-                    self._say(line, "bold")
+                    self._console.print(line, style="bold")
         elif message.key.endswith("/health"):
             health = Health.model_validate_json(message.text)
             if self._states.get(message.key) != health.state:
                 self._states[message.key] = health.state
-                self._say(lines.health_line(health), _STYLES.get(health.state))
+                self._console.print(lines.health_line(health), style=_STYLES.get(health.state))
         else:
             report = Report.model_validate_json(message.text)
-            self._say(lines.report_line(report), _STYLES.get(report.state) if report.state in _BAD_STATES else None)
-
-    def _say(self, line: str, style: str | None) -> None:
-        self._console.print(line, style=style)
-        sys.stdout.flush()
-
-
-def _show_json(message: "TopicMessage") -> None:
-    sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
-    sys.stdout.flush()
+            bad = _STYLES.get(report.state) if report.state in _BAD_STATES else None
+            self._console.print(lines.report_line(report), style=bad)
 
 
 def _fetch_healths(

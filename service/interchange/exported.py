@@ -18,7 +18,6 @@ from models.errors import MachineFileError, RecordingError, WireError
 from models.levels.limits import unit_of
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
-from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor
 from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording
@@ -29,6 +28,11 @@ from rotorwatch.records.levels import ChannelLevels
 
 _ROWS = 65536
 _MESSAGES = 1000
+_READINGS = {
+    "relative_change": "relative change",
+    "standard_error": "standard error of the relative change",
+    "z": "change over its standard error",
+}
 _Row = dict[str, object]
 
 
@@ -49,9 +53,11 @@ class Selection:
     to_ns: int | None = None
     si: bool = False  # whether samples are converted to SI units
 
-    def ordered(self) -> list[Path]:
-        """Recordings in order of their starts."""
-        return sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path))
+    def messages(self, key: str) -> Iterator[tuple[Path, RecordedMessage]]:
+        """Messages under a key, and the recording of each."""
+        for path in sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path)):
+            for message in read_recording(path, keys={key}):
+                yield path, message
 
     def root(self) -> str:
         """Prefix of the machine's keys.
@@ -93,23 +99,15 @@ class Table:
 
 
 def stream_table(selection: Selection) -> Table:
-    """Samples, one row per instant: ``time_ns`` and a column per channel, gaps kept.
-
-    Raises
-    ------
-    RecordingError
-        If there is no stream or no descriptor, or the channels change within the recordings.
-    """
+    """Samples, one row per instant: ``time_ns`` and a column per channel, gaps kept."""
     root = selection.root()
     descriptor = _descriptor(selection, f"{root}/descriptor")
     fields = [_field("time_ns", pa.int64(), "ns", "acquisition time since 1970-01-01 UTC")]
-    factors = []
+    factors = [channel.to_si if selection.si else 1.0 for channel in descriptor.channels]
+    kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
     for channel in descriptor.channels:
-        factors.append(channel.to_si if selection.si else 1.0)
-        kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
         unit = channel.si_unit if selection.si else channel.unit
-        place = f"{channel.quantity}, {channel.location}, {channel.way}"
-        fields.append(_field(channel.name, kind, unit, place))
+        fields.append(_field(channel.name, kind, unit, f"{channel.quantity}, {channel.location}, {channel.way}"))
     metadata = {
         "site": descriptor.site,
         "machine": descriptor.machine,
@@ -139,12 +137,11 @@ def report_table(selection: Selection) -> Table:
         _field("low_confidence", pa.bool_(), "", "whether it was found in data outside the model"),
         _field("reason", pa.string(), "", "why the window was not evaluated"),
     ]
-    for name, text in PARAMETER_TEXT.items():
-        fields += [
-            _field(f"{name}.relative_change", pa.float64(), "1", f"{text}: relative change"),
-            _field(f"{name}.standard_error", pa.float64(), "1", f"{text}: standard error of the relative change"),
-            _field(f"{name}.z", pa.float64(), "1", f"{text}: change over its standard error"),
-        ]
+    fields += [
+        _field(f"{name}.{value}", pa.float64(), "1", f"{text}: {meaning}")
+        for name, text in PARAMETER_TEXT.items()
+        for value, meaning in _READINGS.items()
+    ]
     fields += _level_fields(selection)
     return _message_table(selection, "report", fields, _report_row, "end_ns")
 
@@ -152,7 +149,7 @@ def report_table(selection: Selection) -> Table:
 def _level_fields(selection: Selection) -> list[pa.Field]:
     """A column for each level of each channel that occurs in any report."""
     found: dict[str, pa.Field] = {}
-    for _, message in _messages(selection, f"{selection.root()}/report"):
+    for _, message in selection.messages(f"{selection.root()}/report"):
         with suppress(ValidationError):  # reported when its row is read
             for levels in _Levels.model_validate_json(message.payload).levels:
                 pp = levels.detection == "peak to peak"
@@ -195,16 +192,10 @@ def _field(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Fiel
     return pa.field(name, kind, metadata={"unit": unit, "description": description})
 
 
-def _messages(selection: Selection, key: str) -> Iterator[tuple[Path, RecordedMessage]]:
-    for path in selection.ordered():
-        for message in read_recording(path, keys={key}):
-            yield path, message
-
-
 def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
     """The channel descriptor; all of them must be the same."""
     found: ChannelDescriptor | None = None
-    for path, message in _messages(selection, key):
+    for path, message in selection.messages(key):
         try:
             descriptor = ChannelDescriptor.model_validate_json(message.payload)
         except ValidationError as error:
@@ -223,10 +214,10 @@ def _stream_batches(
     selection: Selection, key: str, descriptor: ChannelDescriptor, factors: Sequence[float], table: Table
 ) -> Iterator[pa.RecordBatch]:
     """Collect blocks in batches; blocks that overlap or cannot be used are left out and listed in `skipped`."""
-    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]] = []
+    pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.floating]]] = []
     count, last_ns = 0, -(2**63)
     tolerance_ns = round(5e8 / descriptor.rate_hz)
-    for path, message in _messages(selection, key):
+    for path, message in selection.messages(key):
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
@@ -243,7 +234,7 @@ def _stream_batches(
         low = 0 if selection.from_ns is None else int(np.searchsorted(time_ns, selection.from_ns))
         high = time_ns.size if selection.to_ns is None else int(np.searchsorted(time_ns, selection.to_ns))
         if low < high:
-            pending.append((time_ns, block, slice(low, high)))
+            pending.append((time_ns[low:high], block.samples[low:high]))
             count += high - low
         if count >= _ROWS:
             yield _batch(pending, factors, table)
@@ -253,16 +244,13 @@ def _stream_batches(
 
 
 def _batch(
-    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]], factors: Sequence[float], table: Table
+    pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.floating]]], factors: Sequence[float], table: Table
 ) -> pa.RecordBatch:
-    times = np.concatenate([time_ns[rows] for time_ns, _, rows in pending])
-    samples = np.concatenate([block.samples[rows] for _, block, rows in pending])
+    times, samples = map(np.concatenate, zip(*pending, strict=True))
     columns = [pa.array(times)]
-    for number, factor in enumerate(factors):
-        column = samples[:, number]
+    for field_, column, factor in zip(list(table.schema)[1:], samples.T, factors, strict=True):
         values = column if factor == 1.0 else column.astype(np.float64) * factor
-        kind = table.schema.field(number + 1).type.to_pandas_dtype()
-        columns.append(pa.array(np.ascontiguousarray(values, dtype=kind)))
+        columns.append(pa.array(np.ascontiguousarray(values, dtype=field_.type.to_pandas_dtype())))
     table.rows += times.size
     return pa.record_batch(columns, schema=table.schema)
 
@@ -275,7 +263,7 @@ def _message_table(
     table = Table(pa.schema(fields, metadata={"key": key}), iter(()))
 
     def rows() -> Iterator[_Row]:
-        for path, message in _messages(selection, key):
+        for path, message in selection.messages(key):
             try:
                 found = row(message.payload)
             except ValidationError as error:
@@ -298,14 +286,11 @@ def _message_table(
 def _report_row(payload: bytes) -> _Row:
     report = Report.model_validate_json(payload)
     row: _Row = dict(vars(report))
-    if report.verdict is not None:
-        row["verdict"] = report.verdict.text
-        row["changed"] = " ".join(finding.name for finding in report.verdict.changed)
-        row["confidence"] = report.verdict.confidence
-        row["low_confidence"] = report.verdict.low_confidence
+    if (verdict := report.verdict) is not None:
+        row |= {"verdict": verdict.text, "changed": " ".join(finding.name for finding in verdict.changed)}
+        row |= {"confidence": verdict.confidence, "low_confidence": verdict.low_confidence}
     for reading in report.parameters:
-        for value in ("relative_change", "standard_error", "z"):
-            row[f"{reading.name}.{value}"] = getattr(reading, value)
+        row |= {f"{reading.name}.{value}": getattr(reading, value) for value in _READINGS}
     for levels in report.levels:
         row |= {f"{levels.channel}.{name}": value for name, value in _level_values(levels).items()}
     return row

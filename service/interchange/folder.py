@@ -16,7 +16,7 @@ import numpy as np
 from models.ingest import lasting
 from models.machine import MachineFile
 from models.signals.block import FloatArray
-from service.interchange.angle import pulse_times
+from service.interchange.blocks import pulse_times
 from service.interchange.clock import Clock, clock_for
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Gap, Piece, Read, Signal, pieces, signals_of
@@ -87,7 +87,8 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
     # The time column may continue from one file to the next.
     runs_on = base.start is not None and base.column is not None and schedule is None
     dated = base.start is None and any(kind.dated for kind in map(mapping.format_of, paths) if kind)
-    if base.is_absolute or runs_on or dated:
+    counted = isinstance(base.start, str)  # from a known zero
+    if base.is_datetime or counted or runs_on or dated:
         return _by_their_own_times(paths, mapping, machine)
     if base.start_ns is not None:
         if schedule is None:
@@ -190,17 +191,13 @@ def unusable(files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFi
         except SourceError as error:
             faults[file.path] = error
     if machine.schedule is not None and isinstance(mapping.time.start, datetime):
-        forms = {_form(file.path) for file in files if file.path not in faults}
+        forms = {re.sub(r"\d+", "0", file.path.name) for file in files if file.path not in faults}
         for path, fault in faults.items():
-            if forms and _form(path) not in forms:
+            if forms and re.sub(r"\d+", "0", path.name) not in forms:
                 raise SourceError(
                     f"{fault}; whether it counts among the others its name does not say: move it out of the folder"
                 )
     return faults
-
-
-def _form(path: Path) -> str:
-    return re.sub(r"\d+", "0", path.name)
 
 
 def runs_of_pulses(
@@ -211,13 +208,7 @@ def runs_of_pulses(
     machine: MachineFile,
     keyphasor: Keyphasor,
 ) -> list[FloatArray]:
-    """Pulse times of the first file (`begun`) and the others, on the first file's clock; contiguous files share a run.
-
-    Raises
-    ------
-    SourceError
-        If a file cannot be used.
-    """
+    """Pulse times of all files, `begun` those of the first, on its clock; contiguous files share a run."""
     runs = [begun]
     for file in files:
         with _opened(file, mapping, machine, first) as (source, _, clock):

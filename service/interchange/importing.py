@@ -20,8 +20,7 @@ from models.machine import MachineFile
 from models.signals.block import lowest_valid_hz, settling_s
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
-from service.interchange.angle import AngleColumn, pulse_times, read_pulses
-from service.interchange.blocks import BlockMaker, Written
+from service.interchange.blocks import AngleColumn, BlockMaker, Written, pulse_times, read_pulses
 from service.interchange.clock import Clock, clock_for
 from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
 from service.interchange.mapping import Mapping
@@ -144,19 +143,13 @@ def _imported(
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise
+    others = set(path.iterdir()) - {one.path for one in files} if path.is_dir() else set()
+    left_out = sorted(one.name for one in others if not one.name.startswith("."))
     by_name = path.is_dir() and mapping.time.start is None and files[0].start_ns is not None
-    written = maker.written
-    left_out, doubts = _left_out(path, files), [signal.doubt for signal in signals if signal.doubt]
+    doubts = [signal.doubt for signal in signals if signal.doubt]
     return Imported(
-        path, recording, machine, mapping, clock, read, written, angle, cut_rows, left_out, [], by_name, doubts
+        path, recording, machine, mapping, clock, read, maker.written, angle, cut_rows, left_out, [], by_name, doubts
     )
-
-
-def _left_out(path: Path, files: tuple[SnapshotFile, ...]) -> list[str]:
-    if not path.is_dir():
-        return []
-    names = {one.path.name for one in files}
-    return sorted(one.name for one in path.iterdir() if one.name not in names and not one.name.startswith("."))
 
 
 def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut_rows: int) -> str:
@@ -170,150 +163,133 @@ def _nothing(path: Path, machine: MachineFile, read: Read, written: Written, cut
     )
 
 
-def summary_lines(done: Imported) -> list[str]:
+def summary_lines(done: Imported) -> Iterator[str]:
     """Describe an import in sentences, with every gap, filled row, cut end and limit of validity."""
     machine, read, written = done.machine, done.read, done.written
     several = f"{read.files} files, " if read.files > 1 else ""
     if read.shortest < read.longest:
         several = f"{read.files} files of {read.shortest} to {read.longest} rows, "
-    lines = [
-        f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
-        f"{len(machine.sensors)} channels of {machine.title}",
-        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
-        f"{rfc3339(written.end_ns)}",
-        *done.doubts,
-        *_folder_lines(done),
-        *_gap_lines(done),
-        *_filter_lines(done),
-        *_angle_lines(done),
-    ]
+    channels, span = len(machine.sensors), f"{rfc3339(written.start_ns)} to {rfc3339(written.end_ns)}"
+    rows = f"{several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz"
+    yield f"{done.source}: {rows}, {channels} channels of {machine.title}"
+    yield f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {span}"
+    yield from done.doubts
+    yield from _folder_lines(done)
+    yield from _gap_lines(done)
+    yield from _filter_lines(done)
+    yield from _angle_lines(done)
     if read.left_out:
         every = " in every channel" if done.mapping.time.not_finite == "missing" else ""
-        lines.append(
-            f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype{every}: {read.left_out}"
-        )
+        yield f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype{every}: {read.left_out}"
     never = []
     for name, times in written.missing.items():
         lost_s = sum(end_ns - from_ns for from_ns, end_ns in times) / 1e9
         stretches = f" in {len(times)} stretches" if len(times) > 1 else ""
-        lines.append(
+        yield (
             f"missing, in whole blocks: {name}, {lasting(lost_s)}{stretches} from {rfc3339(times[0][0])} to "
             f"{rfc3339(times[-1][1])}"
         )
         if round(lost_s * machine.rate_hz) >= written.samples:
             never.append(name)
     if never:
-        lines.append(
+        yield (
             f"note: no block without missing numbers: {', '.join(never)}; a column that has them in some rows only, "
             "such as one of a lower rate, has to be filled up in the file, or left out of the mapping and of the "
             "machine file"
         )
     if written.none_whole:
-        lines.append(f"samples left out in blocks in which every channel lacks numbers: {written.none_whole}")
+        yield f"samples left out in blocks in which every channel lacks numbers: {written.none_whole}"
     if written.too_short:
-        lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
-    lines += _snapshot_lines(machine, written)
+        yield f"samples left out in stretches shorter than a block: {written.too_short}"
+    yield from _snapshot_lines(machine, written)
     length_s = written.samples / machine.rate_hz
     if length_s < machine.window_data_s:
-        lines.append(
+        yield (
             f"note: {length_s:.6g} s of data do not fill one window of {machine.window.length_s:g} s; reports will be "
             "few or none"
         )
-    return lines
 
 
-def _folder_lines(done: Imported) -> list[str]:
+def _folder_lines(done: Imported) -> Iterator[str]:
     names = done.left_out
-    lines = []
     if done.by_name:
         zone = done.mapping.time.zone or "UTC (if they are local time, say time.zone in the mapping)"
-        lines.append(f"times: those in the file names, in {zone}")
+        yield f"times: those in the file names, in {zone}"
     if names:
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        lines.append(f"not read in the folder, as no files of a known format: {', '.join(names[:_NAMED])}{more}")
-    return lines
+        yield f"not read in the folder, as no files of a known format: {', '.join(names[:_NAMED])}{more}"
 
 
-def _gap_lines(done: Imported) -> list[str]:
+def _gap_lines(done: Imported) -> Iterator[str]:
     schedule = done.machine.schedule
     gaps = done.read.gaps
     if schedule is not None:
         gaps = [gap for gap in gaps if not schedule.is_silence((gap.to_ns - gap.from_ns) / 1e9)]
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
-    lines = [f"gaps: {len(gaps)}, {lasting(total_s)} in all, kept as gaps" if gaps else "gaps: none"]
-    lines += [
-        f"  before row {gap.row + 1}{f' of {gap.file}' if done.read.files > 1 else ''}: "
-        f"{lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(done.clock.origin_ns + round(gap.from_ns))}"
-        for gap in gaps[:_LISTED]
-    ]
+    yield f"gaps: {len(gaps)}, {lasting(total_s)} in all, kept as gaps" if gaps else "gaps: none"
+    for gap in gaps[:_LISTED]:
+        file, begun_ns = f" of {gap.file}" if done.read.files > 1 else "", done.clock.origin_ns + round(gap.from_ns)
+        yield f"  before row {gap.row + 1}{file}: {lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(begun_ns)}"
     if len(gaps) > _LISTED:
-        lines.append(f"  and {len(gaps) - _LISTED} more")
+        yield f"  and {len(gaps) - _LISTED} more"
     if done.read.filled:
-        lines.append(
+        yield (
             f"rows put into gaps of up to {done.mapping.time.fill_gaps_up_to_s:g} s by straight lines: "
             f"{done.read.filled}"
         )
-    return lines
 
 
-def _snapshot_lines(machine: MachineFile, written: Written) -> list[str]:
+def _snapshot_lines(machine: MachineFile, written: Written) -> Iterator[str]:
     """Note on snapshots that are too short for the monitor, in the file or after the filters."""
-    if machine.schedule is None:
-        return []
     least = floor(machine.hop_data_s * machine.rate_hz + 1e-6)
     short = [length for length in written.lengths if length < least]
-    if not short:
-        return []
-    return [
-        f"note: {len(short)} of {len(written.lengths)} snapshots are shorter than [schedule] on_s = "
-        f"{machine.schedule.on_s:g} in the machine file and will not be evaluated; the shortest has "
-        f"{min(short) / machine.rate_hz:.6g} s, the longest of them {max(short) / machine.rate_hz:.6g} s"
-    ]
+    if machine.schedule is not None and short:
+        yield (
+            f"note: {len(short)} of {len(written.lengths)} snapshots are shorter than [schedule] on_s = "
+            f"{machine.schedule.on_s:g} in the machine file and will not be evaluated; the shortest has "
+            f"{min(short) / machine.rate_hz:.6g} s, the longest of them {max(short) / machine.rate_hz:.6g} s"
+        )
 
 
-def _filter_lines(done: Imported) -> list[str]:
-    lines = []
+def _filter_lines(done: Imported) -> Iterator[str]:
     acceleration, machine = done.mapping.acceleration, done.machine
     if acceleration is not None:
         corner_hz = acceleration.high_pass_hz
         lowest_hz = lowest_valid_hz(corner_hz)
-        lines.append(
+        yield (
             f"integrated from acceleration: {', '.join(acceleration.channels)}; high-pass at {corner_hz:g} Hz, valid "
             f"from {lowest_hz:g} Hz, not below; the first and last {settling_s(corner_hz):.6g} s of each stretch are "
             "left out"
         )
         if lowest_hz > machine.window.band_hz[0]:
-            lines.append(
+            yield (
                 f"note: the machine file evaluates from window.band_hz = {machine.window.band_hz[0]:g} Hz on, which is "
                 f"below {lowest_hz:g} Hz"
             )
     if done.clock.ratio != 1:
         ratio = done.clock.ratio
         lowest_rate_hz = min(machine.rate_hz, done.clock.rate_hz)
-        lines.append(
+        yield (
             f"resampled from {done.clock.rate_hz:.9g} to {machine.rate_hz:.9g} Hz by {ratio.numerator}/"
             f"{ratio.denominator} (polyphase); flat up to {0.42 * lowest_rate_hz:.4g} Hz"
         )
     if done.cut_rows:
-        lines.append(f"rows left out at the ends of stretches, where filters settle: {done.cut_rows}")
-    return lines
+        yield f"rows left out at the ends of stretches, where filters settle: {done.cut_rows}"
 
 
-def _angle_lines(done: Imported) -> list[str]:
+def _angle_lines(done: Imported) -> Iterator[str]:
     if done.angle.pulses is not None:
         lines, speed_rpm = _pulse_lines(done, done.angle.pulses)
+        yield from lines
     elif (mean_rpm := done.angle.speed_rpm) is not None:
         speed_rpm = abs(mean_rpm)
         way = ", from z to y" if mean_rpm < 0 else ""
-        lines = [f"shaft angle: {speed_rpm:.6g} rpm on average{way}"]
+        yield f"shaft angle: {speed_rpm:.6g} rpm on average{way}"
     else:
-        return []
+        return
     operation = done.machine.operation
     if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
-        lines.append(
-            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed"
-        )
-    return lines
+        yield (f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed")
 
 
 def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:

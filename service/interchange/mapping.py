@@ -6,7 +6,7 @@ One TOML file; ``docs/interchange.md`` explains each field.
 import re
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import Annotated, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self
 from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
@@ -16,8 +16,7 @@ from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from models.signals.sensor import Sensor
-from service.interchange.formats import Format
-from service.interchange.source import Source, SourceError
+from service.interchange.source import Format, Source, SourceError
 
 _DATETIME = "datetime"
 _ZEROS_NS = {"unix": 0, "datenum": -719_529 * 86_400 * 10**9}
@@ -113,11 +112,6 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
         return self.column is not None and self.unit == _DATETIME
 
     @property
-    def is_absolute(self) -> bool:
-        """Whether the time column is absolute by itself: dates, or a count from a known zero."""
-        return self.is_datetime or isinstance(self.start, str)
-
-    @property
     def start_ns(self) -> int | None:
         """Start in nanoseconds since 1970, if it is given."""
         if self.start is None:
@@ -205,20 +199,18 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
         if not path.is_file():
             raise SourceError(f"{path}: no such file")
         kind, base = self.format_of(path), self.time
-        zone = base.zone or "UTC"
         if kind is None:
             suffixes = ", ".join(suffix for known in Format for suffix in known.suffixes)
             raise SourceError(
                 f"{path}: format {path.suffix or 'without a suffix'!r} is not known; say format = ... in the mapping, "
                 f"or name the file {suffixes}"
             )
+        options: dict[str, Any] = {}
+        if kind in {Format.CSV, Format.PARQUET}:
+            options["zone"] = base.zone or "UTC"
         if kind is Format.CSV:
-            found = kind.reader(path, self.csv, base.column, datetimes=base.is_datetime, zone=zone)
-        elif kind is Format.PARQUET:
-            found = kind.reader(path, zone=zone)
-        else:
-            found = kind.reader(path)
-        return cast(Source, found)
+            options |= {"form": self.csv, "time_column": base.column, "datetimes": base.is_datetime}
+        return kind.open(path, **options)
 
     def check_against(self, machine: MachineFile) -> None:
         """Check that every channel of the machine is mapped exactly once, in a unit of its quantity.

@@ -1,4 +1,4 @@
-"""Interface of file formats to the importer. A new format is one class, and a row of `service.interchange.formats`.
+"""Interface of file formats to the importer. A new format is one class, and a row of `Format`.
 
 A source yields columns as they are in the file, in pieces, and the time and units that the file states. It does not
 check them: units, times and numbers are checked in one place for all formats.
@@ -6,8 +6,10 @@ check them: units, times and numbers are checked in one place for all formats.
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -24,6 +26,40 @@ Array = npt.NDArray[Any]
 
 class SourceError(MachineFileError):
     """A file from another program cannot be imported; the message names file, column and, where there is one, row."""
+
+
+class Format(StrEnum):
+    """Format of a file."""
+
+    source: str  # class in this package, imported together with its library when needed
+    suffixes: tuple[str, ...]  # endings of file names
+    dated: bool  # whether files state when they were recorded
+
+    def __new__(cls, name: str, source: str, suffixes: tuple[str, ...], dated: bool = False) -> Self:
+        """Create a member from its name in a mapping, class, suffixes, and whether files are dated."""
+        kind = str.__new__(cls, name)
+        kind._value_, kind.source, kind.suffixes, kind.dated = name, source, suffixes, dated
+        return kind
+
+    CSV = "csv", "tables.CsvSource", (".csv", ".txt", ".tsv", ".csv.gz", ".txt.gz")
+    PARQUET = "parquet", "tables.ParquetSource", (".parquet", ".pq")
+    NPZ = "npz", "arrays.NumpySource", (".npz",)
+    MAT = "mat", "arrays.MatlabSource", (".mat", ".h5", ".hdf5")
+    WAV = "wav", "arrays.WavSource", (".wav",)
+    UFF = "uff", "acquisition.UniversalSource", (".uff", ".unv")
+    TDMS = "tdms", "acquisition.TdmsSource", (".tdms",), True
+    MF4 = "mf4", "acquisition.MdfSource", (".mf4", ".mdf"), True
+
+    @classmethod
+    def of(cls, path: Path) -> Self | None:
+        """Format by the ending of a file's name; None if unknown."""
+        return next((kind for kind in cls if path.name.lower().endswith(kind.suffixes)), None)
+
+    def open(self, path: Path, **options: Any) -> "Source":
+        """Open a file with the `Source` class that reads this format."""
+        module, _, name = self.source.partition(".")
+        found: Source = getattr(import_module(f"service.interchange.{module}"), name)(path, **options)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +84,8 @@ class Timing:
     time: Reference | None = None
 
 
-class Source:
-    """An open file of named columns; a context manager.
+class Source(AbstractContextManager["Source", None]):
+    """An open file of named columns.
 
     A subclass finds the columns of its format and passes them as `columns`, objects of the format's library by name.
     The methods here serve columns that have a length and can be sliced, in a file without time and units; a subclass
@@ -115,9 +151,6 @@ class Source:
 
     def close(self) -> None:
         """Close the file, if it is still open."""
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -19,8 +19,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.machines import DetectableChanges
 from rotorwatch.records.windows import Parameter, SensorFault
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.history.records import StoreError
 from service.history.store import Store
 from service.monitor.alarms.alarm import NotInTime, OperationConflict, OperationRefused, OperatorAction, UnknownAlarm

@@ -8,8 +8,7 @@ from models.machine import MachineFile
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.history.machine import MachineStore
 from service.monitor.alarms.alarm import OperatorAction
 from service.monitor.reports import Identity, Tally

@@ -19,8 +19,7 @@ from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
 from rotorwatch.records.machines import DetectableChanges
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion

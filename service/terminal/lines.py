@@ -28,18 +28,17 @@ def report_line(report: Report) -> str:
     """
     verdict = report.verdict
     if report.parameters and not report.shapes:
-        parts = [
-            "  ".join(_change(one.name, one.relative_change, one.standard_error) for one in _shown(report))
-            or _TOO_LITTLE
-        ]
-        parts += [] if verdict is None else [_verdict(verdict)]
-        parts += [_opinion(opinion) for opinion in report.opinions]
-        tail = "  |  ".join(parts)
+        read = "  ".join(_change(one.name, one.relative_change, one.standard_error) for one in _shown(report))
+        told = [read or _TOO_LITTLE]
+        if verdict is not None:
+            changed = f"changed: {_names(verdict) or '?'}" if _found(verdict) else "no change"
+            told.append(changed + _OUTSIDE * verdict.outside_model)
+        told += [_opinion(opinion) for opinion in report.opinions]
     else:
         told = [one.text for one in report.levels if report.state == "watching" or one.beyond]
         if report.shapes:  # no parameter can be read on this machine: growth of levels, or the reason
             told.append(report.level_growth.text if report.level_growth else report.reason)
-        tail = "  |  ".join(told) or report.reason or f"window {report.filled:.0%} full"
+    tail = "  |  ".join(told) or report.reason or f"window {report.filled:.0%} full"
     # A change was found, but no alarm is raised (yet): "healthy" would contradict the finding.
     state = "no alarm" if report.state == "healthy" and _found(verdict) else report.state
     return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {state:<13}  {tail}"
@@ -141,11 +140,6 @@ def _shown(report: Report) -> tuple[Parameter, ...]:
 def _found(verdict: Verdict | None) -> bool:
     """Whether a change was found; one before the data of this window, without named parameters, does not count."""
     return verdict is not None and bool(verdict.changed or (verdict.detected and not verdict.settled))
-
-
-def _verdict(verdict: Verdict) -> str:
-    text = f"changed: {_names(verdict) or '?'}" if _found(verdict) else "no change"
-    return text + _OUTSIDE * verdict.outside_model
 
 
 def _names(verdict: Verdict) -> str:

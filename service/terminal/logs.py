@@ -20,9 +20,8 @@ def configure_logging(settings: LogSettings) -> None:
         structlog.stdlib.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
-    as_json = settings.format == "json"
     final: list[Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
-    if as_json:
+    if settings.format == "json":
         final += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
     else:
         final.append(
@@ -56,17 +55,10 @@ def logger(**context: str) -> FilteringBoundLogger:
 
 
 class Limiter:
-    """Limits the rate of log lines of each kind, and counts those withheld.
-
-    Parameters
-    ----------
-    quiet_s : float
-        Least time between two lines of a kind.
-    """
+    """Leaves at least `quiet_s` between two log lines of a kind, and counts those withheld."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, quiet_s: float = _QUIET_S) -> None:
-        self._clock = clock
-        self._quiet_s = quiet_s
+        self._clock, self._quiet_s = clock, quiet_s
         self._next_s: dict[str, float] = {}
         self._withheld: dict[str, int] = {}
 

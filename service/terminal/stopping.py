@@ -3,8 +3,9 @@
 import queue
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 _TICK_S = 0.25
 
@@ -39,16 +40,23 @@ class StopRequest:
 
 @contextmanager
 def stop_request() -> Iterator[StopRequest]:
-    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop; the previous handlers are restored afterwards.
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop within the block.
 
     SIGHUP is sent when the terminal is closed; if it is ignored (nohup), it stays ignored.
     """
     stop = StopRequest()
     numbers = [signal.SIGINT, signal.SIGTERM]
     numbers += [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
-    before = {number: signal.signal(number, lambda *_: stop.ask()) for number in numbers}
-    try:
+    with handled(numbers, lambda *_: stop.ask()):
         yield stop
+
+
+@contextmanager
+def handled(numbers: Iterable[signal.Signals], handler: Callable[..., Any]) -> Iterator[None]:
+    """Handle signals within the block; the previous handlers are restored afterwards."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)

@@ -1,1 +1,1 @@
-"""Pictures of the results of `service.analysis`, one module per kind of ``rotorwatch plot``."""
+"""Pictures of the results of `service.analysis`, for ``rotorwatch plot``."""

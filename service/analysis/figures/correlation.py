@@ -40,8 +40,10 @@ def _paint(window: WindowStatistics, panels: tuple[Panel, ...], name: str, netwo
         upper.set_title(f"({panel.reading.equation})  {panel.reading.title}", fontweight="bold")
         if panel.curves:
             _curves(upper, figure.add_subplot(grid[row + 1, column], sharex=upper), panel)
-        else:
-            _empty(upper, panel)
+            continue
+        upper.set_axis_off()
+        text = f"not evaluable\n{panel.reading.reason}"
+        upper.text(0.5, 0.5, text, transform=upper.transAxes, ha="center", va="center", color=GREY, wrap=True)
     figure.legend(
         handles=[
             Line2D([], [], color=INK, linewidth=3.2, alpha=0.35, label="measured in the window"),
@@ -85,12 +87,3 @@ def _curves(upper: Axes, lower: Axes, panel: Panel) -> None:
     if panel.over == "angle":
         lower.set_xlim(0, 360)
         lower.set_xticks(np.arange(0, 361, 90))
-
-
-def _empty(axes: Axes, panel: Panel) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.grid(visible=False)
-    axes.spines[:].set_visible(False)
-    text = f"not evaluable\n{panel.reading.reason}"
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=GREY, wrap=True)

@@ -21,14 +21,12 @@ from models.signals.block import FloatArray
 from service.analysis.figures.style import (
     COLOURS,
     GREY,
-    INK,
     PLATE,
     Look,
     Paint,
     along_path,
     frame_plane,
     heading,
-    mark_text,
     place_text,
     rotation_text,
     speeds_text,
@@ -154,12 +152,19 @@ def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
     axes.tick_params(labelsize=8)
     along, unit = along_path(found.speed_rad_s, found.time_ns)
     for at in spread_marks(along, amplitude * np.exp(1j * lag), _APART * float(np.max(amplitude))):
-        axes.plot(lag[at], amplitude[at], "o", color=COLOURS[1], markersize=4, zorder=4)
-        axes.annotate(
-            mark_text(along[at], unit), (lag[at], amplitude[at]), xytext=(4, 4),
-            textcoords="offset points", fontsize=8, color=COLOURS[1], bbox=PLATE, zorder=5,
-        )  # fmt: skip
+        _label(axes, (lag[at], amplitude[at]), along[at], unit, size=4, offset=(4, 4))
     axes.set_xlabel(f"{found.order}× amplitude, {found.units[number]}; marks: {unit}", fontsize=8, color=GREY)
+
+
+def _label(
+    axes: Axes, place: tuple[float, float], value: float, unit: str, *, size: float, offset: tuple[int, int]
+) -> None:
+    """Mark a point of a path, and write its speed or time beside it."""
+    axes.plot(*place, "o", color=COLOURS[1], markersize=size, zorder=4)
+    axes.annotate(
+        f"{value:.0f}" if unit.endswith("rpm") else f"{value:.3g}", place, xytext=offset,
+        textcoords="offset points", fontsize=8, color=COLOURS[1], bbox=PLATE, zorder=5,
+    )  # fmt: skip
 
 
 def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
@@ -185,19 +190,18 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
     norm = Normalize(float(along.min()), float(along.max()))
     panels = figure.subplots(1, columns, squeeze=False)[0]
     for number, (axes, pair) in enumerate(zip(panels, found.pairs, strict=True)):
-        y, z = (values[:, number] - values[0, number] for values in (found.y_um, found.z_um))
-        path = np.stack([y, z], axis=1)
+        path = np.stack([found.y_um[:, number], found.z_um[:, number]], axis=1)
+        names = planes_of(pair).names
+        start = f"start: {names[0]} {path[0, 0]:.4g} µm, {names[1]} {path[0, 1]:.4g} µm"
+        path = path - path[0]
+        y, z = path.T
         lines = LineCollection(list(np.stack([path[:-1], path[1:]], axis=1)), cmap="viridis_r", norm=norm)
         lines.set_array((along[:-1] + along[1:]) / 2)
         axes.add_collection(lines)
         axes.scatter(y, z, c=along, cmap="viridis_r", norm=norm, s=9, zorder=3, linewidths=0)
-        _frame(axes, found, number, y, z, clearance_um)
+        _frame(axes, names, start, path, clearance_um)
         for at in spread_marks(along, y + 1j * z, 0.12 * float(np.ptp(axes.get_xlim()))):
-            axes.plot(y[at], z[at], "o", color=COLOURS[1], markersize=4.5, zorder=4)
-            axes.annotate(
-                mark_text(along[at], unit), (y[at], z[at]), xytext=(5, 4), textcoords="offset points", fontsize=8,
-                color=COLOURS[1], bbox=PLATE, zorder=5,
-            )  # fmt: skip
+            _label(axes, (y[at], z[at]), along[at], unit, size=4.5, offset=(5, 4))
         if clearance_um is not None:
             axes.add_patch(Circle((0, clearance_um / 2), clearance_um / 2, fill=False, color=GREY, linestyle="--"))
         axes.set_title(f"{pair[0].location}", fontweight="bold")
@@ -208,23 +212,14 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
     return figure
 
 
-def _frame(
-    axes: Axes, found: Centreline, number: int, y: np.ndarray, z: np.ndarray, clearance_um: float | None
-) -> None:
+def _frame(axes: Axes, names: tuple[str, str], start: str, path: FloatArray, clearance_um: float | None) -> None:
     """Set limits with equal scales on both axes, and state the start position."""
-    names = planes_of(found.pairs[number]).names
-    frame_plane(axes, names, "µm from the start")
-    start = f"start: {names[0]} {found.y_um[0, number]:.4g} µm, {names[1]} {found.z_um[0, number]:.4g} µm"
     if clearance_um is not None:
         start += f"\ncircle: clearance of {clearance_um:g} µm, if the shaft lies at its bottom to begin with"
-    axes.text(
-        0.02, 0.985, start, transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, bbox=PLATE, zorder=6,
-    )  # fmt: skip
+    frame_plane(axes, names, "µm from the start", start, bbox=PLATE, zorder=6)
     half = clearance_um / 2 if clearance_um else 0.0
-    ends = [(min(float(one.min()), low), max(float(one.max()), high)) for one, low, high in (
-        (y, -half, half), (z, 0.0, 2 * half)
-    )]  # fmt: skip
-    reach = 0.6 * max(*(high - low for low, high in ends), 1.0)
-    (left, right), (bottom, top) = ends
+    left, bottom = np.minimum(path.min(axis=0), (-half, 0.0)).tolist()
+    right, top = np.maximum(path.max(axis=0), (half, 2 * half)).tolist()
+    reach = 0.6 * max(right - left, top - bottom, 1.0)
     axes.set_xlim((left + right) / 2 - reach, (left + right) / 2 + reach)
     axes.set_ylim((bottom + top) / 2 - reach, (bottom + top) / 2 + 1.15 * reach)

@@ -218,21 +218,22 @@ def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarr
         if at > frequency[-1]:
             continue
         near = np.abs(frequency - at) <= 1.5 * found.resolution_hz
-        axes.axvline(at, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
         unit, _ = shown_as(channel, found.scaling)
         high = f": {values[near].max():.3g} {unit}" if found.scaling == "amplitude" and near.any() else ""
-        _name_order(axes, f"{order}×", at, order, of_axis=at / order / float(frequency[-1]))
+        _mark_order(axes, at, order, of_axis=at / order / float(frequency[-1]))
         texts.append(f"{order}× {at:.4g} Hz{high}")
     axes.set_title("     ".join(texts), loc="right", color=COLOURS[1])
 
 
-def _name_order(axes: Axes, text: str, at: float, order: int, *, of_axis: float) -> None:
-    """Label an order beside its line; if orders are close, each label is placed below that of the order before."""
+def _mark_order(axes: Axes, at: float, order: int, *, of_axis: float) -> None:
+    """Mark an order with a line and its name; if orders are close, each name is below that of the order before."""
+    axes.axvline(at, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
     close = of_axis < _CLOSE
     away = close and at < 0  # keeps clear of the labels on the positive side
     axes.annotate(
-        text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(-3 if away else 3, -2 - 11 * close * (order - 1)),
-        textcoords="offset points", ha="right" if away else "left", va="top", fontsize=8, color=COLOURS[1],
+        f"{'−' if at < 0 else ''}{order}×", (at, 1.0), xycoords=("data", "axes fraction"),
+        xytext=(-3 if away else 3, -2 - 11 * close * (order - 1)), textcoords="offset points",
+        ha="right" if away else "left", va="top", fontsize=8, color=COLOURS[1],
     )  # fmt: skip
 
 
@@ -290,7 +291,8 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
     count = len(found.pairs)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 2.4 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    known = bool(np.isfinite(found.speed_rad_s))
+    # Without the shaft angle, the sense of rotation and thus forward precession are unknown.
+    sides = ("reverse", "forward") if np.isfinite(found.speed_rad_s) else ("z to y", "y to z")
     to = found.useful
     if lines.to_hz is not None:
         to = lines.to_hz / (abs(found.speed_rad_s) / (2 * np.pi)) if found.orders else lines.to_hz
@@ -302,22 +304,14 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
         axes.set_title(f"{pair[0].location}   {' and '.join(one.name for one in pair)}", fontweight="bold")
         axes.set_ylabel("µm p-p")
         _heights(axes, values[clear], _dynamic_range(found) if lines.log else None, 1.22)
-        _sides(axes, known=known)
+        for at, side, text in zip((0.01, 0.99), ("left", "right"), sides, strict=True):
+            axes.text(at, 0.97, text, transform=axes.transAxes, ha=side, va="top", color=INK, fontstyle="italic")
         _marks(axes, found, values, shown)
     panels[-1].set_xlim(-to, to)
     panels[-1].set_xlabel("order" if found.orders else "frequency, Hz")
     text = f"{found.resolution:.3g} {'orders' if found.orders else 'Hz'}, Hann, {found.averages} averages"
     heading(figure, look, f"{name}: full spectrum", (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
     return figure
-
-
-def _sides(axes: Axes, *, known: bool) -> None:
-    """Label both sides; without the shaft angle, the sense of rotation and thus forward precession are unknown."""
-    for at, side, text in (
-        (0.01, "left", "reverse" if known else "z to y"),
-        (0.99, "right", "forward" if known else "y to z"),
-    ):
-        axes.text(at, 0.97, text, transform=axes.transAxes, ha=side, va="top", color=INK, fontstyle="italic")
 
 
 def _marks(axes: Axes, found: FullSpectrum, values: np.ndarray, shown: npt.NDArray[np.bool_]) -> None:
@@ -332,9 +326,7 @@ def _marks(axes: Axes, found: FullSpectrum, values: np.ndarray, shown: npt.NDArr
             near = shown & (np.abs(found.lines - sign * order * turns) <= 1.5 * found.resolution)
             if not near.any():
                 continue
-            axes.axvline(sign * order * turns, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
-            text, of_axis = f"{'−' if sign < 0 else ''}{order}×", turns / float(np.ptp(found.lines[shown]))
-            _name_order(axes, text, sign * order * turns, order, of_axis=of_axis)
+            _mark_order(axes, sign * order * turns, order, of_axis=turns / float(np.ptp(found.lines[shown])))
             heights.append(f"{values[near].max():.3g}")
         if len(heights) == 2:
             texts.append(f"{order}× forward {heights[1]}, reverse {heights[0]} µm p-p")

@@ -89,27 +89,24 @@ def draw(path: Path, look: Look, paint: Paint) -> None:
         If the file cannot be written.
     """
     with style.context(["default", _STYLE]):
-        _write(paint(look), path, look.dpi)
-
-
-def _write(figure: Figure, path: Path, dpi: float) -> None:
-    kind = path.suffix.lower().removeprefix(".")
-    engine = figure.get_layout_engine()
-    if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout
-        if kind == "svg":
-            FigureCanvasSVG(figure)
-        else:
-            FigureCanvasAgg(figure)
-            figure.set_dpi(dpi)
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-    try:
-        if kind == "svg":
-            figure.savefig(path, format="svg", metadata={"Date": None})
-        else:
-            figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
-    except OSError as error:
-        raise PictureError(f"{path}: cannot be written ({error.strerror or error})") from error
+        figure = paint(look)
+        as_svg = path.suffix.lower() == ".svg"
+        engine = figure.get_layout_engine()
+        if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout
+            if as_svg:
+                FigureCanvasSVG(figure)
+            else:
+                FigureCanvasAgg(figure)
+                figure.set_dpi(look.dpi)
+            engine.execute(figure)
+            figure.set_layout_engine(None)
+        try:
+            if as_svg:
+                figure.savefig(path, metadata={"Date": None})
+            else:
+                figure.savefig(path, dpi=look.dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
+        except OSError as error:
+            raise PictureError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *details: str) -> None:
@@ -117,10 +114,8 @@ def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *d
     first, last = (clock(time_ns) for time_ns in span_ns)
     when = f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
     figure.suptitle(look.title or title, x=0.012, y=0.995, ha="left", va="top", fontsize=11.5, fontweight="bold")
-    height = figure.get_figheight()
-    figure.text(
-        0.012, 1 - 0.27 / height, "   ·   ".join(filter(None, (when, *details))), ha="left", va="top", color=GREY
-    )
+    height, text = figure.get_figheight(), "   ·   ".join(filter(None, (when, *details)))
+    figure.text(0.012, 1 - 0.27 / height, text, ha="left", va="top", color=GREY)
     engine = figure.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):
         engine.set(rect=(0.006, 0.006, 0.988, 1 - 0.48 / height - 0.006))
@@ -131,13 +126,14 @@ def place_text(channel: Channel) -> str:
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
-def frame_plane(axes: Axes, names: tuple[str, str], unit: str) -> None:
-    """Give the axes y and z one scale, and label them with the names of the sensors or of `planes_of`."""
+def frame_plane(axes: Axes, names: tuple[str, str], unit: str, text: str, **style: Any) -> None:
+    """Give the axes y and z one scale, label them with names of sensors or of `planes_of`, and write a text inside."""
     for axis, way, name in zip((axes.xaxis, axes.yaxis), "yz", names, strict=True):
         axis.set_label_text(f"{name if ' of ' in name else f'{way}: {name}'}, {unit}")
     axes.axhline(0, color=GREY, linewidth=0.6)
     axes.axvline(0, color=GREY, linewidth=0.6)
     axes.set_aspect("equal")
+    axes.text(0.02, 0.985, text, transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, **style)
 
 
 def rotation_text(direction: int) -> str:
@@ -165,11 +161,6 @@ def along_path(speed_rad_s: FloatArray, time_ns: npt.NDArray[np.int64]) -> tuple
     seconds = (time_ns - time_ns[0]) / 1e9
     unit, length = next((unit, length) for unit, length in _UNITS if seconds[-1] >= 2 * length or length == 1)
     return seconds / length, f"time after the start, {unit}"
-
-
-def mark_text(value: float, unit: str) -> str:
-    """Format one label of `along_path`."""
-    return f"{value:.0f}" if unit.endswith("rpm") else f"{value:.3g}"
 
 
 def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> list[int]:
@@ -200,8 +191,7 @@ def time_axis(axes: Axes, *, vertical: bool = False) -> None:
     axis = axes.yaxis if vertical else axes.xaxis
     locator = AutoDateLocator(tz="UTC", minticks=4, maxticks=9)  # type: ignore[no-untyped-call]  # stub without types
     axis.set_major_locator(locator)
-    formatter = ConciseDateFormatter(locator, tz="UTC", show_offset=not vertical)  # type: ignore[no-untyped-call]  # same
-    axis.set_major_formatter(formatter)
+    axis.set_major_formatter(ConciseDateFormatter(locator, tz="UTC", show_offset=not vertical))  # type: ignore[no-untyped-call]
     axis.set_label_text("time, UTC")
 
 

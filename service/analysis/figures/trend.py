@@ -56,13 +56,8 @@ def paint_trend(trend: TrendSeries, look: Look) -> Figure:
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]
     small = len(trend.levels) + len(measures)
     figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 0.8 * small)), layout="constrained")
-    panels = figure.subplots(
-        1 + count + small,
-        1,
-        sharex=True,
-        squeeze=False,
-        gridspec_kw={"height_ratios": [0.16, *[1.0] * count, *[0.75] * small]},
-    )[:, 0]
+    heights = [0.16, *[1.0] * count, *[0.75] * small]
+    panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
     ends = as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns]))
     panels[-1].set_xlim(*ends)
@@ -104,9 +99,8 @@ def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
     if trend.alarms:
         handles.append(Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, label="alarm raised"))
     if any(alarm.kind == "cleared" for alarm in trend.alarms):
-        handles.append(
-            Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, linestyle="--", label="alarm cleared")
-        )
+        colour = SEVERITY_COLOURS["alert"]
+        handles.append(Line2D([], [], color=colour, linewidth=1.3, linestyle="--", label="alarm cleared"))
     return handles
 
 

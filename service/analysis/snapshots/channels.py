@@ -137,9 +137,7 @@ def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
     power = np.clip(_DIGITS - 1 - np.floor(np.log10(np.abs(solid))), -22, 22)
     up, down = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
     rounded = np.where(array == 0, 0.0, np.round(solid * up / down) * down / up)
-    return tuple(
-        value if is_finite else None for value, is_finite in zip(rounded.tolist(), finite.tolist(), strict=True)
-    )
+    return tuple(value if known else None for value, known in zip(rounded.tolist(), finite.tolist(), strict=True))
 
 
 def known_figures(values: npt.ArrayLike) -> tuple[float, ...]:

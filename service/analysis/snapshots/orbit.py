@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phas
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
-from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
+from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
 
 MOST_REVOLUTIONS = 64
 _MOST_SAMPLES = 20_000
@@ -37,13 +36,7 @@ class _Vectors:
 
 
 def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions.
-
-    Raises
-    ------
-    SnapshotError
-        If `revolutions` is negative or too large.
-    """
+    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions."""
     machine, known, window = subject.machine, subject.known, data.window
     there = orbit_pairs(machine.sensors)
     pairs = [pair for pair in there if not data.missing & {state_name(one) for one in pair}]
@@ -68,9 +61,8 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         predicted[0] = _predicted(known, known.rotor, window)
         predicted[1] = None if estimated_reason else _predicted(known, changed(known.rotor, changes), window)
     others = [(pair, _path(machine, path, pair, units)) for pair in pairs if pair not in places]
-    head = heading(subject, data)
     return OrbitSnapshot(
-        **head,
+        **heading(subject, data, changes, lacking, estimated_reason),
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
             _window_orbit(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places
@@ -79,7 +71,6 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         revolutions=path.count,
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
         pulses_s=known_figures(path.pulses / machine.rate_hz),
-        theory=theory(changes, lacking, estimated_reason),
         reason=reason,
         path_reason=path.reason,
     )
@@ -102,12 +93,12 @@ def _window_orbit(
     path: PathSamples | None,
     units: Units,
 ) -> PlaceOrbit:
-    factor, planes = 1.0 if units == "SI" else 1 / pair[0].to_si, planes_of(pair)
     y = z = ellipse = nominal = estimated = None
     if window is not None and vectors is not None:
+        factor = 1.0 if units == "SI" else 1 / pair[0].to_si
         states = ("y1", "z1") if pair[0].location == "bearing" else ("y2", "z2")
         at, rows = ([every.index(state) for state in states] for every in (window.states, STATES))
-        y, z = (_vector(name, column, vectors, factor) for name, column in zip(planes.names, at, strict=True))
+        y, z = (_vector(name, column, vectors, factor) for name, column in zip(planes_of(pair).names, at, strict=True))
         ellipse = _ellipse(factor * vectors.mean[at], vectors)
         nominal, estimated = (None if q is None else _ellipse(factor * q[rows], vectors) for q in predicted)
     return PlaceOrbit(
@@ -129,10 +120,7 @@ def _path_orbit(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: Pa
         motion = np.array([path.y, path.z], dtype=np.float64)
         q = 2 * (motion * np.exp(-1j * excerpt.angle_rad)).mean(axis=1)
         ellipse = _ellipse(q, _Vectors(q, q[None], -1 if excerpt.speed_rad_s < 0 else 1, absolute=True))
-    unit = "m" if units == "SI" else pair[0].unit
-    return PlaceOrbit(
-        location=pair[0].location, unit=unit, y=None, z=None, ellipse=ellipse, nominal=None, estimated=None, path=path
-    )
+    return _window_orbit(pair, None, None, (), path, units).model_copy(update={"ellipse": ellipse})
 
 
 def _vector(name: str, column: int, vectors: _Vectors, factor: float) -> RunningSpeedVector:
@@ -161,15 +149,12 @@ def _predicted(known: Machine, rotor: RotorParameters, window: WindowStatistics)
 
 def _ellipse(q: ComplexArray, vectors: _Vectors) -> OrbitEllipse:
     found = Ellipse(complex(q[0]), complex(q[1]))
-    with_shaft = found.precession == "forward"
-    sense: Literal["y to z", "z to y"] = "y to z" if with_shaft == (vectors.direction > 0) else "z to y"
-    precession: Literal["forward", "backward"] = "forward" if with_shaft else "backward"
     return OrbitEllipse(
         semi_major=_rounded(found.semi_major),
         semi_minor=_rounded(found.semi_minor),
         tilt_deg=_rounded(found.tilt_deg),
-        sense=sense,
-        precession=precession if vectors.absolute else None,
+        sense="y to z" if (found.precession == "forward") == (vectors.direction > 0) else "z to y",
+        precession=found.precession if vectors.absolute else None,
     )
 
 

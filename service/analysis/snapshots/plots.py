@@ -72,13 +72,7 @@ def waveform_snapshot(
 
 
 def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
-    """Full spectra of the newest seconds at every location with displacements in both directions.
-
-    Raises
-    ------
-    RotorwatchError
-        If there is no such location, or too few samples.
-    """
+    """Full spectra of the newest seconds at every location with displacements in both directions."""
     resolution_hz = min(_FULL_HZ, data.descriptor.rate_hz / 16)
     found = read_full_spectrum(data, recorded_pairs(data), _FULL_S, resolution_hz, orders=False)
     lines = np.abs(found.lines) <= found.useful
@@ -157,13 +151,7 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
 def vector_series(
     data: Sampled | Past, channels: tuple[Channel, ...], order: int, revolutions: int, slow_roll_rpm: float | None
 ) -> VectorSeries:
-    """Vectors of channels: of every window of a history, or of every `revolutions` revolutions of samples.
-
-    Raises
-    ------
-    RotorwatchError
-        If there are none: there is no shaft angle, or the shaft does not turn.
-    """
+    """Vectors of channels: of every window of a history, or of every `revolutions` revolutions of samples."""
     found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
     every = -(-found.time_ns.size // _MOST_VECTORS)
     return VectorSeries(
@@ -187,13 +175,7 @@ def vector_series(
 
 
 def centreline_series(data: Sampled | Past) -> CentrelineSeries:
-    """Mean shaft positions at all locations with displacements in both directions.
-
-    Raises
-    ------
-    RotorwatchError
-        If there is no such location, or fewer than two positions.
-    """
+    """Mean shaft positions at all locations with displacements in both directions."""
     pairs = recorded_pairs(data)
     found = read_centreline(data, pairs, _CENTRELINE_S)
     return CentrelineSeries(

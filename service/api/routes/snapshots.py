@@ -17,7 +17,7 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.access.guard import Guard
 from service.access.problems import problem_answer, written
 from service.analysis.snapshots.channels import SnapshotError
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.samples import ChosenWindow, SampleReader
 from service.api.views import PLACE, InPath

@@ -16,8 +16,7 @@ from models.machine import MachineFile
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.monitor.reports import Identity
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks

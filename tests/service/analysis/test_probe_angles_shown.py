@@ -13,7 +13,7 @@ from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.analysis.orbit import orbit_pairs, orbits_of
 from service.analysis.revolutions import Excerpt
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.commands.installation import init
 from service.monitor.conversion import machine_description
 from service.monitor.descriptor import descriptor_mismatch

@@ -16,9 +16,9 @@ from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.figures.run_up import bode, centreline, polar
+from service.analysis.figures.samples import waveform
 from service.analysis.figures.spectrum import Lines, full_spectrum, spectrum
 from service.analysis.figures.style import Look
-from service.analysis.figures.waveform import waveform
 from service.analysis.orbit import in_planes, orbit_pairs, recorded_pairs
 from service.analysis.recorded import Recorded
 from service.analysis.runup import read_centreline, read_run_up

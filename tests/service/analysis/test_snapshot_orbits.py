@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.machine import Machine
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from tests.commissioning.rotor_kit import LAB, NOTHING, elsewhere, stream
 from tests.service.analysis.snapshotting import (
     SECONDS,

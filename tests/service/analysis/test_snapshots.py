@@ -20,7 +20,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.analysis.prediction import Prediction, predict
 from service.analysis.snapshots.channels import SnapshotError
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.routes.snapshots import WindowAnswers
 from simulator.scenario import Event

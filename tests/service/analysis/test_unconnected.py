@@ -13,7 +13,7 @@ from models.signals.block import SampleBlock
 from service.analysis.past import Past
 from service.analysis.recorded import Held, Sampled
 from service.analysis.recorded_window import recorded_window
-from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import LatestData
 from service.analysis.snapshots.plots import (
     centreline_series,
     full_spectrum_snapshot,

@@ -1,4 +1,4 @@
-"""Power spectral densities of the latest window, with theory, and coherence of pairs of channels."""
+"""Correlation functions and power spectral densities of the latest window, with theory, and coherence of pairs."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -10,9 +10,16 @@ from models.diagnosis.window.moments import ComplexArray
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
-from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
-from service.analysis.excitation import LEFT_OUT_BINS
-from service.analysis.prediction import Prediction
+from rotorwatch.records.snapshots import (
+    ChannelDensity,
+    CorrelationPair,
+    CorrelationSnapshot,
+    CrossSpectrum,
+    SpectrumSnapshot,
+    Units,
+)
+from service.analysis.correlation import MeasuredCorrelations, measured_correlations
+from service.analysis.prediction import LEFT_OUT_BINS, Prediction
 from service.analysis.snapshots.channels import (
     SnapshotError,
     check_held,
@@ -23,9 +30,9 @@ from service.analysis.snapshots.channels import (
     product_unit,
     seen_by,
 )
-from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory, unsent
+from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
 
-MOST_LINES = 1000
+_MOST_LINES = 1000
 """Most lines in a snapshot; if the band has more, adjacent lines are averaged."""
 _SEGMENT_CORRELATIONS = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
 """Sums of squared correlations of half-overlapping Hann segments' power: in one line, and in lines 1 and 2 apart."""
@@ -35,38 +42,113 @@ _Spectra = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
 """Two-sided cross-spectra, SI²/Hz: measured, nominal, estimated; shape (n_lines, n, n), in the same order of states."""
 
 
+def correlation_snapshot(
+    subject: Subject,
+    data: LatestData,
+    prediction: Prediction,
+    first: Sequence[str],
+    second: Sequence[str],
+    units: Units,
+) -> CorrelationSnapshot:
+    """Correlation functions of pairs of channels, see `chosen_pairs`, with standard errors and predictions."""
+    machine, window = subject.machine, None if data.window is None else data.window.as_mounted
+    pairs = chosen_pairs(machine, first, second)
+    head = heading(subject, data, prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
+    if window is not None and not (first or second):
+        pairs = tuple(pair for pair in pairs if all(state_name(one) in window.states for one in pair))
+    if window is None or not pairs:
+        return CorrelationSnapshot(
+            **head, lags_s=(), method="samples", band_hz=None, pairs=(), reason=no_window(machine, data)
+        )
+    used = tuple(dict.fromkeys(channel for pair in pairs for channel in pair))
+    check_held(machine, used, window.states)
+    states = tuple(map(state_name, used))
+    columns = [window.states.index(state) for state in states]
+    places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]
+    measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
+    gone = [number for number, (i, j) in enumerate(places) if data.missing & {states[i], states[j]}]
+    measured.values[:, gone] = measured.errors[:, gone] = measured.outside_band[gone] = np.nan
+    nominal, estimated = _predicted(prediction, used, places, measured)
+    return CorrelationSnapshot(
+        **head,
+        lags_s=tuple(measured.lags_s.tolist()),
+        method="samples" if measured.band_hz is None else "spectrum",
+        band_hz=measured.band_hz,
+        pairs=tuple(_pair(pair, number, measured, nominal, estimated, units) for number, pair in enumerate(pairs)),
+        reason=unsent(machine, data),
+    )
+
+
+def _predicted(
+    prediction: Prediction, channels: Sequence[Channel], places: list[tuple[int, int]], measured: MeasuredCorrelations
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Theory for pairs of channels, nominal and estimated; inclined sensors are sums over the states they measure."""
+    states, parts = seen_by(channels)
+    if parts is None:
+        return prediction.correlations(states, places, measured.lags_s, measured.band_hz)
+    n = len(states)
+    every = [(i, j) for i in range(n) for j in range(n)]
+    first, second = zip(*places, strict=True)
+    nominal, estimated = (
+        None if one is None else (parts @ one.reshape(-1, n, n) @ parts.T)[:, list(first), list(second)]
+        for one in prediction.correlations(states, every, measured.lags_s, measured.band_hz)
+    )
+    return nominal, estimated
+
+
+def _pair(
+    pair: tuple[Channel, Channel],
+    number: int,
+    measured: MeasuredCorrelations,
+    nominal: FloatArray | None,
+    estimated: FloatArray | None,
+    units: Units,
+) -> CorrelationPair:
+    unit, factor = product_unit(*pair, units)
+    values, errors = measured.values[:, number], measured.errors[:, number]
+    (z_nominal, series_nominal), (z_estimated, series_estimated) = (
+        (None, None) if one is None else (_rms_z(values - one[:, number], errors), figures(factor * one[:, number]))
+        for one in (nominal, estimated)
+    )
+    return CorrelationPair(
+        first=pair[0].name,
+        second=pair[1].name,
+        unit=unit,
+        measured=figures(factor * values),
+        standard_error=figures(factor * errors),
+        nominal=series_nominal,
+        estimated=series_estimated,
+        nominal_z=z_nominal,
+        estimated_z=z_estimated,
+        outside_band=figures(measured.outside_band[number : number + 1])[0],
+    )
+
+
+def _rms_z(difference: FloatArray, errors: FloatArray) -> float | None:
+    if not np.all(errors > 0):
+        return None
+    return figures([np.sqrt(np.mean((difference / errors) ** 2))])[0]
+
+
 def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     subject: Subject,
     data: LatestData,
     prediction: Prediction,
-    channels: Sequence[str] = (),
-    first: Sequence[str] = (),
-    second: Sequence[str] = (),
-    band_hz: tuple[float, float] | None = None,
-    units: Units = "channel",
+    channels: Sequence[str],
+    first: Sequence[str],
+    second: Sequence[str],
+    band_hz: tuple[float, float] | None,
+    units: Units,
 ) -> SpectrumSnapshot:
-    """Power spectral densities of channels, and cross-spectra and coherence of pairs.
+    """Power spectral densities of channels, see `chosen_channels`, and cross-spectra and coherence of named pairs.
 
-    Parameters
-    ----------
-    channels : sequence of str
-        Names; without names, all channels of the first quantity measured (displacements first).
-    first, second : sequence of str
-        Names of the pairs whose cross-spectrum and coherence are given; none by default.
-    band_hz : tuple of float, optional
-        Lowest and highest frequency, limited to the machine file's band.
-
-    Raises
-    ------
-    SnapshotError
-        If there is no such channel, or the band holds too few lines.
+    The band is limited to that of the machine file.
     """
     machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     chosen = chosen_channels(machine, channels)
     pairs = chosen_pairs(machine, first, second) if first or second else ()
     within = _checked(machine, band_hz)
-    stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
-    head = heading(subject, data)
+    head = heading(subject, data, prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
     if window is not None and not channels:
         chosen = tuple(channel for channel in chosen if state_name(channel) in window.states)
     used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))
@@ -83,7 +165,6 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
             left_out_hz=None,
             densities=(),
             cross=(),
-            theory=stated,
             reason=no_window(machine, data),
         )
     check_held(machine, used, window.states)
@@ -92,7 +173,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
     states = tuple(map(state_name, used))
     columns = [window.states.index(state) for state in states]
-    group = -(-frequencies_hz.size // MOST_LINES)
+    group = -(-frequencies_hz.size // _MOST_LINES)
     of_theory, parts = seen_by(used)
     nominal, estimated = (
         one if one is None else _grouped(one if parts is None else np.asarray(parts @ one @ parts.T), group)
@@ -126,7 +207,6 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
             _cross(pair, states.index(state_name(pair[0])), states.index(state_name(pair[1])), spectra, units)
             for pair in pairs
         ),
-        theory=stated,
         reason=unsent(machine, data),
     )
 
