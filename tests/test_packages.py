@@ -61,11 +61,11 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def in_new_process(code: str, *paths: Path, cwd: Path, arguments: tuple[str, ...] = ()) -> str:
+def in_new_process(code: str, *paths: Path, cwd: Path) -> str:
     """Run code with only the standard library and these folders on its path, and return what it printed."""
     begin = f"import sys; sys.path[:0] = {[str(path) for path in paths]}; "
     done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", begin + code, *arguments], cwd=cwd, capture_output=True, text=True,
+        [sys.executable, "-I", "-S", "-c", begin + code], cwd=cwd, capture_output=True, text=True,
         check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -128,15 +128,6 @@ def test_the_installed_client_loads_no_server(wheels: dict[str, Path], others: P
     assert more == "False False"
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_programs_run_from_an_uninstalled_checkout_and_state_their_version(
-    checkout: Path, others: Path, tmp_path: Path, program: str
-) -> None:
-    code = f"from {PROGRAMS[program]} import app; app(prog_name='{program}')"
-    said = in_new_process(code, checkout, others, cwd=tmp_path, arguments=("--version",))
-    assert said == f"{program} {rotorwatch.__version__}"
-
-
 def test_an_uninstalled_checkout_is_imported_without_torch(checkout: Path, others: Path, tmp_path: Path) -> None:
     code = (
         "import importlib.metadata as m, simulator.commission.command; print('torch' in sys.modules); "
@@ -154,10 +145,17 @@ def test_an_uninstalled_checkout_is_imported_without_torch(checkout: Path, other
         ("rotortrain", ["train"], HEAVY | {"numpy"}, ("rotortrain train --machine lab",)),
     ],
 )
-def test_help_imports_nothing_heavy(program: str, command: list[str], heavy: set[str], said: tuple[str, ...]) -> None:
-    code = f"import sys\nfrom {PROGRAMS[program]} import app\n"
-    code += f"try:\n    app([*{command}, '--help'])\nexcept SystemExit:\n    print(*{heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    *told, loaded = done.stdout.splitlines()
-    assert loaded == ""
+def test_programs_of_an_uninstalled_checkout_state_their_version_and_help_without_heavy_imports(
+    checkout: Path, others: Path, tmp_path: Path,
+    program: str, command: list[str], heavy: set[str], said: tuple[str, ...],
+) -> None:  # fmt: skip
+    code = (
+        f"from {PROGRAMS[program]} import app\n"
+        f"for arguments in (['--version'], [*{command}, '--help']):\n"
+        f"    try:\n        app(arguments, prog_name='{program}')\n    except SystemExit:\n        pass\n"
+        f"print('loaded:', *{heavy} & set(sys.modules))"
+    )
+    version, *told, loaded = in_new_process(code, checkout, others, cwd=tmp_path).splitlines()
+    assert version == f"{program} {rotorwatch.__version__}"
+    assert loaded == "loaded:"
     assert all(word in "\n".join(told) for word in said)

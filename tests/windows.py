@@ -1,13 +1,24 @@
-"""Windows of a stream of blocks, as a monitor makes them."""
+"""Samples of a simulated machine, and windows of a stream of blocks, as a monitor makes them."""
 
 from collections.abc import Iterable, Iterator
+
+import numpy as np
 
 from models.diagnosis.window.moments import Plan, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
-from models.machine import MachineFile
+from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
 from tests.sure import sure
+
+
+def healthy_samples(machine: Machine, duration_s: float, seed: int, *events: Event) -> FloatArray:
+    """Samples of the machine in the shipped healthy scenario with these events."""
+    scenario, _ = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
+    return np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
 
 
 def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterator[WindowStatistics]:

@@ -146,16 +146,12 @@ def healthy(machine: MachineFile, duration_s: float, seed: int, name: str = "hea
 def commissioned(machine: MachineFile, *recordings: HealthyRecording, wished: float | None = None) -> Commissioning:
     entries = [
         HealthyEntry(
-            name=one.name,
-            sha256="0" * 64,
-            start_ns=one.hops[0].start_ns,
-            end_ns=one.hops[-1].end_ns,
-            used_s=one.duration_s,
-            gaps=one.gaps,
+            name=one.name, sha256="0" * 64, start_ns=one.hops[0].start_ns, end_ns=one.hops[-1].end_ns,
+            used_s=one.duration_s, gaps=one.gaps,
         )
         for one in recordings
         if one.hops
-    ]
+    ]  # fmt: skip
     return commission(machine, recordings, entries, wished=wished)
 
 

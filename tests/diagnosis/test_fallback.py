@@ -39,7 +39,7 @@ def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_w
     rate = 0.05
     z = []
     any_changed = 0
-    for commissioning in range(4):
+    for commissioning in range(3):
         windows = recorded(100 + commissioning, healthy + 10)
         shape = learn_shape(windows[:healthy])
         for window in windows[healthy:]:

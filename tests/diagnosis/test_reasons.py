@@ -119,22 +119,19 @@ def test_an_imprecise_reading_states_its_error(window: WindowStatistics) -> None
         assert_beyond(determined(vague, window, 60.0).parameters[0].reason)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.948, 1.052, 2.0])
-def test_a_speed_out_of_range_is_stated_with_its_limit(window: WindowStatistics, factor: float) -> None:
-    tolerance = MACHINE.operation.speed_tolerance
-    off = replace(window, speed_rad_s=MACHINE.operation.speed_rad_s * (1 + (factor - 1) * max(1.0, tolerance / 0.05)))
+@pytest.mark.parametrize(
+    ("mean", "spread"), [*((mean, 0.0) for mean in (0.5, 0.948, 1.052, 2.0)), (1.0, 0.1501), (1.0, 0.2), (1.0, 0.6)]
+)
+def test_a_speed_out_of_range_or_unsteady_is_stated_with_its_limit(
+    window: WindowStatistics, mean: float, spread: float
+) -> None:
+    tolerance, nominal = MACHINE.operation.speed_tolerance, MACHINE.operation.speed_rad_s
+    turning = replace(window, speed_rad_s=nominal * (1 + (mean - 1) * max(1.0, tolerance / 0.05)))
+    if spread:
+        turning = replace(turning, speed_range=(nominal * (1 - spread / 2), nominal * (1 + spread / 2)))
     with pytest.raises(EstimationError) as caught:
-        KnownMachineEvaluator(MACHINE, None).evaluate(off)
+        KnownMachineEvaluator(MACHINE, None).evaluate(turning)
     assert_beyond(str(caught.value))
-
-
-def test_an_unsteady_speed_is_stated_with_its_limit(window: WindowStatistics) -> None:
-    nominal = MACHINE.operation.speed_rad_s
-    for part in (0.1501, 0.2, 0.6):
-        swept = replace(window, speed_range=(nominal * (1 - part / 2), nominal * (1 + part / 2)))
-        with pytest.raises(EstimationError) as caught:
-            KnownMachineEvaluator(MACHINE, None).evaluate(swept)
-        assert_beyond(str(caught.value))
 
 
 def test_networks_give_one_reason_with_its_limit_for_an_unknown_window(window: WindowStatistics) -> None:

@@ -21,12 +21,13 @@ import zenoh
 
 from models.alarm_names import STREAM_LOST
 from models.signals.link import LinkSettings
+from rotorwatch.client.client import Client
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness
 from tests.loopback import session_of
 from tests.service.delivery.hooked import Hook
-from tests.service.rig.live import LAB, Program, endpoint, program
+from tests.service.rig.live import LAB, Program, endpoint, program, until
 from tests.sure import sure
 
 BLOCK_S = 0.2
@@ -234,17 +235,8 @@ class Plant:
 
     def log(self) -> list[Event]:
         """Every alarm event that is in the monitor's log."""
-        with httpx.Client(base_url=self.running.url(), trust_env=False, timeout=_LONGEST_S) as http:
-            found: list[Event] = []
-            after = -1
-            while True:
-                answer = http.get(f"{_PLACE}/alarms/events", params={"after": after, "limit": 1000})
-                page = answer.raise_for_status().json()["events"]
-                if not page:
-                    return found
-                events = [AlarmCloudEvent.model_validate(one) for one in page]
-                found += [_event(one) for one in events]
-                after = events[-1].data.sequence
+        with Client(self.running.url(), timeout_s=_LONGEST_S) as client:
+            return [_event(one) for one in client.alarm_events("demo/lab", after=-1)]
 
     def _operate(self) -> None:
         """Shelve and unshelve an alarm repeatedly, and record what was confirmed."""
@@ -296,11 +288,8 @@ class Plant:
         return published - found()
 
     def wait_for_orders(self, more: int = 2) -> None:
-        before = len(self.answered)
-        deadline = time.monotonic() + _LONGEST_S
-        while len(self.answered) < before + more:
-            assert time.monotonic() < deadline, "operators are not answered"
-            time.sleep(_LOOK_S)
+        wanted = len(self.answered) + more
+        until(lambda: len(self.answered) >= wanted, "answers to operators")
 
 
 def _event(event: AlarmCloudEvent) -> Event:

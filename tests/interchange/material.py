@@ -68,7 +68,6 @@ def archive(folder: Path, **columns: object) -> Path:
 
 
 def summary(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> str:
-    """The summary of an import."""
     return "\n".join(summary_lines(imported(folder, source, mapping, described)[0]))
 
 

@@ -47,7 +47,7 @@ def write(
     return np.column_stack([x, v, a])
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(content=runs, shift_ns=st.integers(0, STEP_NS))
 def test_gaps_stay_gaps_and_every_sample_keeps_its_time(
     tmp_path_factory: pytest.TempPathFactory, content: list[tuple[int, int]], shift_ns: int
@@ -81,7 +81,7 @@ def test_a_duplicated_time_is_named(tmp_path_factory: pytest.TempPathFactory, ro
         imported(folder, folder / "run.parquet", NANOSECONDS + CHANNELS)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     displacement=st.sampled_from(["m", "mm", "um", "µm", "\u03bcm", "mil", "in"]),
     velocity=st.sampled_from(["m/s", "mm/s", "in/s", "ips"]), angle=st.sampled_from(["rad", "deg", "rev"]),
@@ -121,7 +121,7 @@ def test_any_mix_of_units_gives_the_same_motion(
     assert ((si[:, 2] >= 0) & (si[:, 2] < 2 * np.pi)).all()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), drift=st.floats(-5e-5, 5e-5))
 def test_jitter_and_drift_make_no_gaps(tmp_path_factory: pytest.TempPathFactory, seed: int, drift: float) -> None:
     folder = tmp_path_factory.mktemp("jitter")

@@ -77,8 +77,8 @@ def test_a_line_that_doubles_or_appears_is_found_at_any_frequency(hz: float) -> 
 
 
 def test_healthy_windows_raise_nothing() -> None:
-    """200 windows of 110 bands; at six standard errors chance raises none."""
-    raised = sum(grown(noise(1000 + n) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] != "normal" for n in range(200))
+    """100 windows of 110 bands; at six standard errors chance raises none."""
+    raised = sum(grown(noise(1000 + n) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] != "normal" for n in range(100))
     assert raised == 0
     # Nor do lines that move with the speed, nor growth in all bands alike, which the overall level shows.
     assert grown(noise(12) + line(50.2, 1.0) + line(100.4, 0.3), HEALTHY)[0] == "normal"

@@ -65,7 +65,7 @@ def reference() -> HopReference:
 def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> None:
     healthy = reference()
     assert healthy.hops == 60
-    for n in range(40):
+    for n in range(20):
         gain = np.repeat(np.random.default_rng([7, n]).uniform(0.5, 2.0, HOPS), T.size // HOPS)
         samples = gain * noise(100 + n) + (1 + n % 3) * np.cos(THETA)
         assert departure(kurtosis(samples), healthy, 6.0) == 0.0
@@ -144,23 +144,20 @@ def test_a_steady_load_after_commissioning_under_a_cycling_one_is_no_rub() -> No
 LATE = np.arange(T.size) >= round(0.63 * T.size)  # in the midst of a hop
 
 
-def stepping(samples: FloatArray) -> FloatArray:
-    return np.asarray(np.where(LATE, 2.0, 1.0) * samples, dtype=np.float64)
-
-
-def knocking_once(samples: FloatArray) -> FloatArray:
-    return np.asarray(samples + 40.0 * (np.arange(T.size) == T.size - 3000), dtype=np.float64)
-
-
-def humming(samples: FloatArray) -> FloatArray:
-    return np.asarray(samples + 1.5 * np.cos(2 * np.pi * 46.6 * T), dtype=np.float64)  # beside 2x at 46 Hz
-
-
 def meshing_late(samples: FloatArray) -> FloatArray:
     return np.asarray(samples + np.where(LATE, 2.0 * np.cos(11 * THETA), 0.0), dtype=np.float64)
 
 
-@pytest.mark.parametrize("spoilt", [stepping, knocking_once, humming, meshing_late])
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        lambda samples: np.where(LATE, 2.0, 1.0) * samples,
+        lambda samples: samples + 40.0 * (np.arange(T.size) == T.size - 3000),
+        lambda samples: samples + 1.5 * np.cos(2 * np.pi * 46.6 * T),  # beside 2x at 46 Hz
+        meshing_late,
+    ],
+    ids=["step", "knock", "hum", "mesh"],
+)
 def test_a_step_a_single_knock_hum_and_a_new_line_are_neither_rub_nor_impact(
     spoilt: Callable[[FloatArray], FloatArray],
 ) -> None:
@@ -184,6 +181,6 @@ def test_louder_vibration_is_no_2x_and_a_2x_within_it_is_found(*, phase: bool) -
     def louder(samples: FloatArray) -> FloatArray:
         return np.asarray(10 * (samples - 2 * np.cos(THETA)) + 2 * np.cos(THETA), dtype=np.float64)
 
-    assert suspects([0.0] * 12, 0.0, louder, phase=phase) == [""] * 12
+    assert suspects([0.0] * 6, 0.0, louder, phase=phase) == [""] * 6
     twice = 6 * np.cos(2 * THETA + 1)
     assert all(suspects([0.0] * 4, 0.0, lambda samples: louder(samples) + twice, phase=phase))

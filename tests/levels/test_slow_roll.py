@@ -17,10 +17,8 @@ from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile, load_machine, load_machine_file
 from models.signals.block import FloatArray
 from rotorwatch.records.levels import ChannelLevels
-from simulator.scenario import load_scenario
-from simulator.stream import blocks
 from tests.sure import sure
-from tests.windows import fed
+from tests.windows import fed, healthy_samples
 
 PROBE = {"quantity": "displacement", "location": "DE", "unit": "mm"}
 RUNOUT = {"slow_roll_um_pp": 12.0, "slow_roll_phase_lag_deg": 250.0}
@@ -73,9 +71,7 @@ def test_subtracting_the_slow_roll_vector_recovers_the_vibration(turned: int, la
 @cache
 def simulated() -> tuple[Machine, FloatArray]:
     machine = load_machine("lab").model_copy(update={"dtype": "float64"})
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.model_copy(update={"duration_s": 64.0, "seed": 31_207})
-    return machine, np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
+    return machine, healthy_samples(machine, 64.0, 31_207)
 
 
 def with_slow_roll(machine: Machine, **more: dict[str, object]) -> Machine:

@@ -11,11 +11,10 @@ from models.diagnosis.sensors.check import sensor_findings
 from models.machine import load_machine
 from models.signals import keyphasor
 from models.signals.block import FloatArray
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests.signals.test_wire import page_blocks
 from tests.sure import sure
-from tests.windows import statistics
+from tests.windows import healthy_samples, statistics
 
 RATE_HZ, N = 2000.0, 15_000
 SPEED_RAD_S = 138.2
@@ -72,15 +71,13 @@ def voltage(theta: FloatArray, rate_hz: float, edge_s: float) -> FloatArray:
     return np.asarray(LEVEL_V + PULSE_V * np.clip(since_s / edge_s + 0.5, 0, 1) * (since_s < PULSE_S))
 
 
-@pytest.mark.parametrize(("edge_s", "most_deg"), [(1e-3, 1.0), (1e-5, 6.0)])
+@pytest.mark.parametrize(("edge_s", "most_deg"), [(1e-3, 1.0), pytest.param(1e-5, 6.0, marks=pytest.mark.long)])
 def test_an_angle_from_pulses_is_as_good_as_the_true_one(edge_s: float, most_deg: float) -> None:
     machine = load_machine("lab").model_copy(update={"dtype": "float64"})
     wandering = [
         Event(at_s=at, speed_rpm=machine.operation.speed_rpm * (1 + 0.02 * math.sin(at / 10))) for at in range(1, 65)
     ]
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=66.0, seed=31_401, faults=wandering)
-    samples = np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
+    samples = healthy_samples(machine, 66.0, 31_401, *wandering)
     angles = shaft_angles(voltage(samples[:, -1], machine.rate_hz, edge_s))
     begin = next(number for number, angle in enumerate(angles) if angle is not None)
     assert begin < 2 * machine.rate_hz / (machine.operation.speed_rpm / 60) + 10  # two revolutions

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trustme
 import zenoh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -252,6 +252,7 @@ MESSAGES = (
 _PLACES = st.sampled_from(["demo/lab", "demo/pump", "demo/*", "plant/lab", "*/lab", "*/*"])
 
 
+@settings(max_examples=30)
 @given(publishes=st.lists(_PLACES), views=st.lists(_PLACES), monitors=st.lists(_PLACES))
 def test_access_control_allows_only_granted_keys(publishes: list[str], views: list[str], monitors: list[str]) -> None:
     if not (publishes or views or monitors):

@@ -223,7 +223,7 @@ def test_the_chunk_that_names_the_keys_may_be_damaged(tmp_path: Path) -> None:
     assert salvage.unnamed_messages > 300
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(place=st.floats(0, 1), keep=st.floats(0, 1), flips=st.integers(0, 3))
 def test_recovered_messages_were_written_whatever_the_damage(
     tmp_path_factory: pytest.TempPathFactory, place: float, keep: float, flips: int

@@ -113,9 +113,7 @@ PAYLOAD = b"\0" * 48
     [
         (PAYLOAD, _header(), "text/plain", "encoding 'text/plain' is not"),
         (PAYLOAD, _header()[:-1], BLOCK_ENCODING, "header .* has 31 bytes, expected 32"),
-        (PAYLOAD, b"", BLOCK_ENCODING, "header .* has 0 bytes, expected 32"),
         (PAYLOAD, _header(dtype=0), BLOCK_ENCODING, "dtype is 0, expected 1"),
-        (PAYLOAD, _header(dtype=3), BLOCK_ENCODING, "dtype is 3, expected 1"),
         (b"", _header(samples=0), BLOCK_ENCODING, "samples is 0, expected 1 to 1000000"),
         (b"", _header(samples=1_000_001), BLOCK_ENCODING, "samples is 1000001, expected 1 to 1000000"),
         (b"", _header(channels=0), BLOCK_ENCODING, "channels is 0, expected 1 to 64"),
@@ -272,19 +270,14 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     np.testing.assert_allclose(samples[:, 2], angle % (2 * np.pi), atol=1e-6)
 
 
-def _compressed(n_values: int, codec: str) -> bytes:
-    column = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(n_values, np.float32)), 10)
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+def test_compressed_streams_are_refused_unread(codec: str) -> None:
+    column = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10_000_000, np.float32)), 10)
     schema = pa.schema([pa.field("samples", column.type)], metadata={"start_ns": "0", "sequence": "0", "run": "1"})
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, schema, options=pa.ipc.IpcWriteOptions(compression=codec)) as writer:
         writer.write_batch(pa.record_batch([column], schema=schema))
-    packed: bytes = sink.getvalue().to_pybytes()
-    return packed
-
-
-@pytest.mark.parametrize("codec", ["zstd", "lz4"])
-def test_compressed_streams_are_refused_unread(codec: str) -> None:
-    bomb = _compressed(10_000_000, codec)
+    bomb = sink.getvalue().to_pybytes()
     tracemalloc.start()
     with pytest.raises(WireError, match="compressed"):
         decode_block(bomb, b"", ARROW_ENCODING)
@@ -308,7 +301,7 @@ def test_numbers_have_the_same_bounds_in_both_encodings(field: str, text: str) -
     assert len(str(refused.value)) < 300
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_a_damaged_arrow_stream_is_refused_or_a_block(data: st.DataObject) -> None:
     payload = bytearray(encode_arrow(_block(), "")[0])

@@ -20,7 +20,6 @@ from simulator.recorder import record
 from simulator.rotortrain import app
 from tests.commissioning.rotor_kit import LAB, stream
 from tests.service.rig.live import machine_file
-from tests.service.rig.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
@@ -43,9 +42,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_machine_is_commissioned_again_only_with_a_reason(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
-    variables = {**os.environ, "COLUMNS": "200"}
-    found = ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
-    assert found.returncode == 0, found.stderr
+    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they take long
+    found = run(folder, *arguments)
+    assert found.exit_code == 0, found.stderr
     assert "bundle: kit" in found.stdout
     machine = load_machine_file(folder / "machine.toml")
     first = load_commissioned(folder / "kit", machine)
@@ -57,7 +56,6 @@ def test_a_machine_is_commissioned_again_only_with_a_reason(folder: Path, monkey
     assert report["identity"] == first.identity
     assert "<html" in (folder / "kit" / "report.html").read_text(encoding="utf-8")
 
-    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they were drawn above
     again = run(folder, *arguments)
     assert again.exit_code == 2
     assert "kit holds version 1 of the commissioning of demo/lab: say why it is replaced" in again.stderr
@@ -81,7 +79,11 @@ def test_a_machine_is_commissioned_again_only_with_a_reason(folder: Path, monkey
 
 @pytest.mark.parametrize(
     ("of", "damaged", "why"),
-    [("heavy", False, "trained for another machine"), ("lab", True, "weights.safetensors"), ("lab", False, "")],
+    [
+        ("heavy", False, "trained for another machine"),
+        ("lab", False, ""),
+        pytest.param("lab", True, "weights.safetensors", marks=pytest.mark.long),
+    ],
 )
 def test_unusable_networks_are_removed_by_a_new_commissioning(
     folder: Path, of: str, damaged: bool, why: str, monkeypatch: pytest.MonkeyPatch

@@ -357,6 +357,7 @@ def test_recordings_and_commissioned_conditions_are_on_the_page(folder: Path) ->
     assert [float(edge) for edge in found.groups()] == pytest.approx([1e3 * low, 1e3 * high], rel=6e-3)
     seen = section(written(folder, "no phase reference")[0], "recordings")
     assert "1, 0.1 s missing" in seen
+    assert "one gap of 0.1 s" in section(written(folder, "no phase reference")[0], "checks")
     assert "speed 1320 rpm" in seen
 
 
@@ -444,7 +445,7 @@ def kit(*, turned: bool, full: bool) -> tuple[Commissioning, HealthyRecording, M
     rotor = TURNED if turned else LAB
     scenario, _ = load_scenario("healthy")
     sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
-    scenario = scenario.model_copy(update={"duration_s": 100.0, "seed": 77_205, "sensors": sensors})
+    scenario = scenario.model_copy(update={"duration_s": 70.0, "seed": 77_205, "sensors": sensors})
     without = rotor.model_dump(exclude={"rotor", "operation", "condition"})
     machine = rotor if full else MachineFile.model_validate(without)
     seen = recording(machine, [block for block, _ in blocks(scenario, rotor, 1.0)])

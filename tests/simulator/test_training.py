@@ -172,9 +172,9 @@ def test_calibration_scales_errors_for_one_source_and_for_several_separately() -
 
 
 def test_recalibrating_a_bundle_without_training_is_repeatable(bundle: Bundle, tmp_path: Path) -> None:
-    first = tmp_path / "trained"
-    save_bundle(first, COARSE, bundle.networks, bundle.manifest.training, bundle.amortised)
+    trained = tmp_path / "trained"
+    first = save_bundle(trained, COARSE, bundle.networks[:1], bundle.manifest.training, bundle.amortised)
     with briefly():
-        calibrate_again(COARSE, str(first), tmp_path / "again", 1)
+        calibrate_again(COARSE, str(trained), tmp_path / "again", 1)
     again = load_bundle(tmp_path / "again", COARSE)
-    assert (again.manifest, again.identity) == (bundle.manifest, bundle.identity)
+    assert (again.manifest, again.identity) == (first.manifest, first.identity)

@@ -41,10 +41,8 @@ def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
 @pytest.mark.parametrize(
     ("name", "rotor", "low", "high"),
     [
-        pytest.param("k_by", changed_rotor(ROTOR, {"k_by": -0.1}), -0.12, -0.06, marks=pytest.mark.long),
         pytest.param("c_by", changed_rotor(ROTOR, {"c_by": -0.3}), -0.40, -0.20, marks=pytest.mark.long),
         pytest.param("k_bz", changed_rotor(ROTOR, {"k_bz": -0.1}), -0.12, -0.06, marks=pytest.mark.long),
-        pytest.param("c_bz", changed_rotor(ROTOR, {"c_bz": -0.3}), -0.40, -0.20, marks=pytest.mark.long),
         ("e", changed_rotor(ROTOR, {"e": 0.5}), 0.2, 0.9),
     ],
 )
@@ -92,15 +90,14 @@ def test_parameters_that_cannot_be_read_state_a_reason() -> None:
     assert all(reading.reason for reading in monitor().diagnose(short).parameters)
 
 
-@pytest.mark.parametrize("plane", ["y", "z"])
-def test_a_1x_vector_that_no_unbalance_causes_is_unexplained(plane: str) -> None:
+def test_a_1x_vector_that_no_unbalance_causes_is_unexplained() -> None:
     """An unbalance is one force in both planes: a plane whose sensors are all reversed shows two."""
     quiet = replace(OTHER, level_N=1.0)
     reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
     (window,) = recorded(ROTOR, quiet, 3)
     q = sure(window.synchronous).copy()
     assert not reading.diagnose(window).unexplained
-    q[[number for number, name in enumerate(window.states) if name.startswith(plane)]] *= -1
+    q[[number for number, name in enumerate(window.states) if name.startswith("y")]] *= -1
     diagnosis = reading.diagnose(replace(window, synchronous=q))
     assert "the 1× vibration is not what an unbalance causes" in diagnosis.unexplained
     reasons = {one.name: one.reason for one in diagnosis.parameters}

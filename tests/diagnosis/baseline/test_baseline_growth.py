@@ -46,23 +46,14 @@ def test_expected_stiffness_growth_is_the_growth_seen_or_up_to_two_per_cent() ->
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_stiffening_of_a_bearing_under_another_force_is_no_change() -> None:
     learned, window = baseline("stiffening", 1), later("stiffening", 1, 4)
     assert all(one is not None and one.slope > 2 * one.standard_error for one in learned.growth)
-    monitor = BaselineDiagnostician(learned)
-    reading = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
+    diagnosis = BaselineDiagnostician(learned).diagnose(window)
+    reading = next(one for one in diagnosis.evaluable if one.name == "k_by")
     assert sure(reading.relative_change) < -0.02  # the weaker motion meets a softer bearing
-    assert isolate_window(monitor.diagnose(window), 0.01).changed == ()
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json())
-    assert again.baseline().growth == learned.growth
-    assert again.diagnostician().diagnose(window).parameters == monitor.diagnose(window).parameters
-    older = BaselineRecord.of(replace(learned, growth=()))  # as before growth was recorded
-    assert "growth" not in older.model_dump(mode="json")
-    assert older.baseline().growth == ()
-    before = next(one for one in older.diagnostician().diagnose(window).evaluable if one.name == "k_by")
-    now = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
-    assert before.relative_change == now.relative_change
-    assert sure(now.standard_error) > 2 * sure(before.standard_error)
+    assert isolate_window(diagnosis, 0.01).changed == ()
 
 
 @pytest.mark.slow
@@ -110,6 +101,22 @@ def test_parameters_that_a_window_does_not_determine_make_no_sensor_suspect() ->
             assert sure(diagnosis.misfit_z) < 3
     horizontal = sure(learned.growth[0])
     assert abs(horizontal.slope) < min(2.0, 2 * horizontal.standard_error)
+
+
+def test_growth_widens_the_stiffness_of_another_motion_and_survives_its_record() -> None:
+    learned, (window, *_) = with_a_force_that_hides_a_plane()
+    vertical = sure(learned.growth[1])
+    grown = replace(learned, growth=(None, replace(vertical, slope=0.2, standard_error=0.01, power=vertical.power / 4)))
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(grown).model_dump_json())
+    assert again.baseline().growth == grown.growth
+    older = BaselineRecord.of(replace(learned, growth=()))  # as before growth was recorded
+    assert "growth" not in older.model_dump(mode="json")
+    assert older.baseline().growth == ()
+    found = [one.diagnostician().diagnose(window) for one in (again, older)]
+    assert found[0].parameters == BaselineDiagnostician(grown).diagnose(window).parameters
+    now, before = (next(one for one in each.evaluable if one.name == "k_bz") for each in found)
+    assert now.relative_change == before.relative_change
+    assert sure(now.standard_error) > 2 * sure(before.standard_error)
 
 
 def test_a_reversed_sensor_is_suspected_even_in_a_hardly_determined_plane() -> None:

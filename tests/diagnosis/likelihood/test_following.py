@@ -75,7 +75,7 @@ def test_a_glance_is_refused_after_a_change_and_before_the_first_search() -> Non
     assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
 
 
-@pytest.mark.parametrize("step", [None, ("k_by", -0.2), ("EI", -0.1), ("e", 0.3)])
+@pytest.mark.parametrize("step", [None, ("k_by", -0.2), pytest.param(("EI", -0.1), marks=pytest.mark.long), ("e", 0.3)])
 def test_the_latest_hops_have_news_only_after_a_change(step: tuple[str, float] | None) -> None:
     sliding, windows = slid(Layout.INDEPENDENT, step)
     fits = LengthFits(LAB)
@@ -83,7 +83,7 @@ def test_the_latest_hops_have_news_only_after_a_change(step: tuple[str, float] |
     assert all(fits.has_news(sliding, windows[-1], (hops,)) == (step is not None) for hops in (2, 4, 7))
 
 
-@pytest.mark.parametrize("kind", ["drift", "late copy"])
+@pytest.mark.parametrize("kind", ["drift", pytest.param("late copy", marks=pytest.mark.long)])
 def test_an_unexplained_window_does_not_affect_the_next(kind: Foreign) -> None:
     """After a window of something else, the next one is read as if it were the first."""
     strange = last_window(plan_for(LAB), as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)))

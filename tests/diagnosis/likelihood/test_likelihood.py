@@ -163,14 +163,14 @@ def assert_honest(z: np.ndarray) -> None:
     ("name", "layout", "excitation"),
     [
         ("lab", Layout.ONE_SOURCE, Excitation.SECOND_ORDER),
-        ("heavy", Layout.INDEPENDENT, Excitation.FOURTH_ORDER),  # which the model does not know
         *(
-            pytest.param(name, layout, Excitation.SECOND_ORDER, marks=pytest.mark.long)
-            for name, layout in itertools.product(("lab", "heavy", "light"), Layout)
-            if (name, layout) != ("lab", Layout.ONE_SOURCE)
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in (
+                *itertools.product(("heavy", "light"), Layout, (Excitation.SECOND_ORDER,)),
+                *(("lab", Layout.INDEPENDENT, Excitation[of]) for of in ("SECOND_ORDER", "FOURTH_ORDER", "HUMP")),
+                ("heavy", Layout.INDEPENDENT, Excitation.FOURTH_ORDER),
+            )
         ),
-        pytest.param("lab", Layout.INDEPENDENT, Excitation.FOURTH_ORDER, marks=pytest.mark.long),
-        pytest.param("lab", Layout.INDEPENDENT, Excitation.HUMP, marks=pytest.mark.long),
     ],
 )
 def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout, excitation: Excitation) -> None:
@@ -179,6 +179,12 @@ def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout
     draw = replace(draw, excitation=excitation)
     z, diagnoses = read(draw, range(8), faults)
     assert_honest(z)
+    vectors = [sure(diagnosis.unbalance) for diagnosis in diagnoses]
+    sizes = [(one.magnitude_change - faults["e"]) / one.magnitude_error for one in vectors]
+    of_vector = np.array([sizes, [sure(one.turned_deg) / sure(one.turned_error_deg) for one in vectors]])
+    assert np.all(np.abs(of_vector.mean(axis=1)) < 1.55)
+    assert np.all(np.sqrt(np.mean(of_vector**2, axis=1)) < 2.1)
+    assert np.sqrt(np.mean(of_vector**2)) < 1.8  # of 16: within 1 + 4/√32, plus 0.1
     most = 4.0 if excitation is Excitation.SECOND_ORDER else 4.5
     assert all((diagnosis.misfit_z or 0) < most for diagnosis in diagnoses)
     if layout is Layout.ONE_SOURCE:  # the bound is sensor noise here: hundredths of a percent
@@ -186,7 +192,7 @@ def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.long) for number in (1, 2))])
 def test_a_single_source_at_a_wandering_speed_is_within_the_model(number: int) -> None:
     """The theory at the mean speed alone deviates by 30 standard errors and more."""
     machine = load_machine("light")
@@ -289,7 +295,7 @@ def test_the_bound_falls_with_the_root_of_time_and_rises_with_unknowns() -> None
 def test_a_window_of_a_single_sensor_can_be_fitted_and_explained(state: str) -> None:
     (sensor,) = (one for one in LAB.sensors if one.name == state)
     lone = LAB.model_copy(update={"sensors": (sensor, LAB.sensors[-1])})
-    for number in range(4):
+    for number in range(2):
         window = simulate_window(Draw(lone, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), number)
         diagnosis = LikelihoodFit(lone).diagnose(window)
         assert not diagnosis.unexplained
@@ -313,11 +319,12 @@ def late(machine: Machine, window: WindowStatistics, delays_s: list[float]) -> W
     return replace(window, spectrum=made @ window.spectrum @ made.conj().swapaxes(1, 2))
 
 
-def told(machine: Machine, window: WindowStatistics) -> tuple[str, float]:
+def told(machine: Machine, window: WindowStatistics) -> tuple[str, float, Diagnosis]:
+    """The suspected delay, its size in µs, and the diagnosis."""
     diagnosis = LikelihoodFit(machine).diagnose(window)
     assert sure(diagnosis.misfit_z) > 5
     name, _, size = diagnosis.suspect.partition(" (")
-    return name, float(size.removesuffix(" µs)"))
+    return name, float(size.removesuffix(" µs)")), diagnosis
 
 
 @cache
@@ -330,15 +337,16 @@ def probes_of_lab(layout: Layout) -> tuple[Machine, WindowStatistics]:
 
 
 @pytest.mark.parametrize(
-    ("layout", "apart_us"), [(Layout.ONE_SOURCE, 30), (Layout.INDEPENDENT, 30), (Layout.ONE_SOURCE, 60)]
+    ("layout", "apart_us"),
+    [(Layout.INDEPENDENT, 30), (Layout.ONE_SOURCE, 60), pytest.param(Layout.ONE_SOURCE, 30, marks=pytest.mark.long)],
 )
 def test_a_converter_that_samples_channels_one_after_another_is_suspected(layout: Layout, apart_us: int) -> None:
     """Its delays resemble damping, which used to be named, under independent forces even without reservation."""
     machine, window = probes_of_lab(layout)
     seen = late(machine, window, [1e-6 * apart_us * number for number in range(len(machine.sensors))])
-    name, delay_us = told(machine, seen)
+    name, delay_us, diagnosis = told(machine, seen)
     assert name == "delay of each channel after the one before"
-    assert apart_us < 60 or LikelihoodFit(machine).diagnose(seen).unexplained
+    assert apart_us < 60 or diagnosis.unexplained
     assert delay_us == pytest.approx(apart_us, rel=0.3)
 
 
@@ -346,7 +354,7 @@ def test_a_converter_that_samples_channels_one_after_another_is_suspected(layout
 def test_a_delayed_channel_is_suspected_whatever_its_mounting(at: dict[str, tuple[float, float]]) -> None:
     lab, window = probes_of_lab(Layout.ONE_SOURCE)
     machine = mounted(lab, at)
-    name, delay_us = told(machine, late(machine, window, [0.0, 0.0, 4e-5, 0.0, 0.0]))
+    name, delay_us, _ = told(machine, late(machine, window, [0.0, 0.0, 4e-5, 0.0, 0.0]))
     assert with_channel_names(name, machine.sensors) == "delay of y2"
     assert delay_us == pytest.approx(40, rel=0.15)
 
@@ -360,7 +368,7 @@ def test_a_delayed_accelerometer_is_suspected() -> None:
     turn = np.where([state == "y2_ddot" for state in states], -(w[:, None] ** 2), 1.0)
     accelerated = replace(window, states=states, spectrum=window.spectrum * turn[:, :, None] * turn[:, None, :])
     machine = Machine.model_validate(lab.model_dump() | {"sensors": sensors})
-    name, delay_us = told(machine, late(machine, replace(accelerated, synchronous=None), [0.0, 0.0, 4e-5, 0.0, 0.0]))
+    name, delay_us, _ = told(machine, late(machine, replace(accelerated, synchronous=None), [0.0, 0.0, 4e-5, 0.0, 0.0]))
     assert with_channel_names(name, machine.sensors) == "delay of y2"
     assert delay_us == pytest.approx(40, rel=0.15)
 

@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy.signal import butter, lfilter
 
 from models.diagnosis.sensors.check import sensor_findings
@@ -20,7 +19,7 @@ from models.machine import load_machine
 from models.signals.block import FloatArray
 from models.signals.channels import unit_in_text
 from rotorwatch.records.windows import SensorFault
-from simulator.scenario import NamedSource, Scenario, Sensors
+from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 from tests.sure import sure
 
@@ -53,17 +52,25 @@ def sources_along(directions: FloatArray, cutoff_hz: float, force_N: float) -> t
 
 
 @cache
-def recorded(name: str, seed: int, windows: int = 1, *, one_source: bool = False) -> FloatArray:
-    """SI samples of a healthy machine, with a level, a cutoff and a noise drawn from the seed."""
-    rng, machine = np.random.default_rng([seed, 5]), load_machine(name)
-    force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, 3)
+def recorded(
+    name: str, seed: int, windows: int = 1, *, one_source: bool = False, noise: float | None = None,
+    events: tuple[Event, ...] = (), key: int = 5, largest: float = 3.0,
+) -> FloatArray:  # fmt: skip
+    """SI samples of all channels and, last, the shaft angle; level and cutoff are drawn from the seed.
+
+    So is the noise, if it is not given.
+    """
+    rng, machine = np.random.default_rng([seed, key]), load_machine(name)
+    force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, largest)
     cutoff_hz, directions = rng.uniform(*machine.condition.cutoff_hz), np.eye(6)[[0, 1, 3, 4]]
     if one_source:
         directions = rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
     sources = sources_along(directions, cutoff_hz, force_N)
     sensors = Sensors(noise_relative=rng.uniform(0.01, 0.05), noise_corner_hz=rng.uniform(30, 500))
+    if noise is not None:
+        sensors = Sensors(noise_relative=noise)
     scenario = Scenario(
-        machine=name, seed=seed, duration_s=windows * WINDOW_S + MORE_S, sources=sources, sensors=sensors
+        machine=name, seed=seed, duration_s=windows * WINDOW_S + MORE_S, sources=sources, sensors=sensors, events=events
     )
     return np.concatenate([plan_of(name).to_si(block.samples) for block, _ in blocks(scenario, machine, 1.0)])
 
@@ -136,10 +143,9 @@ def test_a_sensor_that_has_just_stuck_is_named_without_a_value() -> None:
     assert "y1: repeated one value for 1.5 s" in only(found_in(samples)).text
 
 
-@pytest.mark.parametrize("state", ["y1", "z1"])
-def test_a_sensor_without_any_signal_is_named_as_stuck(state: str) -> None:
-    found = found_in(spoilt(state, np.zeros_like))
-    assert ("stuck", (state,)) in [(finding.kind, finding.states) for finding in found]
+def test_a_sensor_without_any_signal_is_named_as_stuck() -> None:
+    found = found_in(spoilt("y1", np.zeros_like))
+    assert ("stuck", ("y1",)) in [(finding.kind, finding.states) for finding in found]
 
 
 def test_a_shaft_angle_that_stops_turning_is_named_as_stuck() -> None:
@@ -235,14 +241,12 @@ def coarse(own: FloatArray) -> FloatArray:
     return np.asarray(np.round(own / (10 * own.std()) + 0.45) * 10 * own.std())
 
 
-def something_else(own: FloatArray) -> FloatArray:
-    return np.asarray(own.std() * np.random.default_rng(0).standard_normal(own.size))
-
-
 @pytest.mark.parametrize(
     ("state", "change", "kind", "states", "value"),
     [
-        ("z1", coarse, "stuck", {"z1"}, None), ("z1_dot", something_else, "incoherent", {"z1", "z1_dot"}, None),
+        ("z1", coarse, "stuck", {"z1"}, None),
+        ("z1_dot", lambda own: own.std() * np.random.default_rng(0).standard_normal(own.size), "incoherent",
+         {"z1", "z1_dot"}, None),
         ("y2", lambda own: own * np.linspace(1, 0.7, own.size), "gain", {"y2"}, None),
         # The share of samples of a normal variable beyond its limits.
         ("y2", clipped(1.5), "clipped", {"y2"}, 0.134), ("y2", clipped(2.0), "clipped", {"y2"}, 0.046),
@@ -350,17 +354,7 @@ def test_swapped_channels_are_found_and_the_reference_tells_which(one: str, othe
     assert finding.kind == "swapped"
     assert {one, other} < set(finding.states)
     assert len(finding.states) == 4
-    reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 900, 2)))
-    assert {one, other} <= implicated(found_in(samples, reference))
-
-
-def test_the_reference_comes_back_from_json_bit_for_bit() -> None:
-    reference = reference_of("lab")
-    assert SensorReference.model_validate_json(reference.model_dump_json()) == reference
-    broken = reference.model_dump(mode="json")
-    broken["pairs"][0]["second"] = "x9"
-    with pytest.raises(ValidationError, match="x9 not among channels"):
-        SensorReference.model_validate(broken, strict=False)
+    assert {one, other} <= implicated(found_in(samples, reference_of("lab")))
 
 
 def test_a_reference_without_usable_healthy_windows_is_an_error() -> None:
@@ -432,8 +426,7 @@ def test_a_channel_that_becomes_delayed_has_no_gain_error_besides(seed: int, *, 
     assert (finding.states, finding.kind) == (("y2_dot",), "delay")
 
 
-@pytest.mark.parametrize("state", ["y1", "y1_dot"])
-@pytest.mark.parametrize(("from_s", "part"), [(50.0, 0.5), (25.0, 0.5), (25.0, 1.0)])
+@pytest.mark.parametrize(("state", "from_s", "part"), [("y1", 50.0, 0.5), ("y1_dot", 25.0, 0.5), ("y1", 25.0, 1.0)])
 def test_noise_that_begins_in_one_channel_is_no_gain_drift(state: str, from_s: float, part: float) -> None:
     plan, samples = plan_of("lab"), recorded("lab", 31).copy()
     noisy = samples[round(from_s * plan.rate_hz) :, plan.states.index(state)]

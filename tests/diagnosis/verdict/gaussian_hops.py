@@ -1,7 +1,4 @@
-"""How long the sequential test takes to find a change, on Gaussian hops with given standard errors."""
-
-from collections.abc import Mapping
-from dataclasses import dataclass
+"""Stories of changes told to the sequential test, in Gaussian hops with given standard errors."""
 
 import numpy as np
 
@@ -10,20 +7,6 @@ from models.diagnosis.verdict.stretch import Stretch, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Verdict
-
-
-@dataclass(frozen=True, slots=True)
-class DelayStudy:
-    """Delays in independent trials from the change to the hop that detected it, and named it alone, or infinity.
-
-    `wrong` trials name at some hop a parameter that did not change; `early` ones detect something before the change,
-    and take no part in the delays.
-    """
-
-    detected_s: FloatArray
-    named_s: FloatArray
-    wrong: int
-    early: int
 
 
 class GaussianHops:
@@ -77,25 +60,3 @@ def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray
                 verdicts.append((number, test.update({h: look for h, look in looks.items() if h in wanted})))
             number += 1
     return verdicts
-
-
-def detection_delays(
-    settings: SequentialSettings, covariance: FloatArray, changes: Mapping[str, float], *, trials: int, seed: int,
-    before_hops: int, after_hops: int,
-) -> DelayStudy:  # fmt: skip
-    """Play relative changes that step at a random moment within a hop, after `before_hops` healthy hops."""
-    step, detected, named = true(**changes), [], []
-    wrong = early = 0
-    for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(trials)):
-        hops, share = GaussianHops(settings, covariance, rng), float(rng.uniform())
-        story = ((before_hops, 0 * step), (1, share * step), (after_hops - 1, step))
-        verdicts = play(SequentialTest(settings), hops, *story)
-        if any(verdict.detected for number, verdict in verdicts if number < before_hops):
-            early += 1
-            continue
-        later = [((number - before_hops + share) * settings.hop_s, one) for number, one in verdicts[-after_hops:]]
-        said = [(delay_s, {finding.name for finding in one.changed}) for delay_s, one in later]
-        wrong += any(names - set(changes) for _, names in said)
-        detected.append(min((delay_s for delay_s, one in later if one.detected), default=np.inf))
-        named.append(min((delay_s for delay_s, names in said if names == set(changes)), default=np.inf))
-    return DelayStudy(np.array(detected), np.array(named), wrong, early)

@@ -23,7 +23,7 @@ from models.diagnosis.verdict.sequential_state import SequentialState
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
-from tests.diagnosis.verdict.gaussian_hops import GaussianHops, detection_delays, play, true
+from tests.diagnosis.verdict.gaussian_hops import GaussianHops, play, true
 from tests.diagnosis.verdict.test_isolation import covariance, window
 
 SEED = 88_300
@@ -65,11 +65,9 @@ def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("declared", "n_hops"), [(8000.0, 1_250), pytest.param(4000.0, 10_000, marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize(("declared", "n_hops"), [(8000.0, 800), pytest.param(4000.0, 10_000, marks=pytest.mark.long)])
 def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) -> None:
-    """Hours of a healthy machine at 8000 declared false alarms per month: 19 are expected in 1250 hops."""
+    """Hours of a healthy machine at 8000 declared false alarms per month: 12 are expected in 800 hops."""
     settings = replace(SETTINGS, false_alarms_per_month=declared, systematic=0.0)
     verdicts = play(SequentialTest(settings), gaussian(SEED, settings), (n_hops, true()))
     last, count = -1000, 0
@@ -88,17 +86,21 @@ def test_false_alarms_come_at_the_declared_rate(declared: float, n_hops: int) ->
     ("name", "change", "within_s"),
     [
         ("c_by", -0.1, None),
-        ("k_by", -0.25, 10.0),
+        pytest.param("k_by", -0.25, 10.0, marks=pytest.mark.long),
         *(pytest.param(*one, None, marks=pytest.mark.long) for one in (("k_by", -0.05), ("c_by", -0.2), ("e", 0.2))),
     ],
 )
 def test_delays_are_within_twice_those_of_a_fixed_length_test(name: str, change: float, within_s: float | None) -> None:
-    """95 of 100 changes are found, and named, within twice the data of a test made for exactly this change."""
-    study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=20, seed=SEED, before_hops=14, after_hops=24)
-    allowed_s = within_s or 2 * fixed_length_s(name, change)
-    assert np.quantile(study.detected_s, 0.95) <= allowed_s
-    assert np.quantile(study.named_s, 0.95) <= allowed_s
-    assert study.wrong == study.early == 0
+    """19 of 20 changes at a random moment within a hop are named within twice the data of a test made for them."""
+    step, named_s = true(**{name: change}), []
+    for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(SEED).spawn(20)):
+        hops, share = GaussianHops(SETTINGS, COVARIANCE, rng), float(rng.uniform())
+        verdicts = play(SequentialTest(SETTINGS), hops, (14, 0 * step), (1, share * step), (23, step))
+        assert not any(verdict.detected for number, verdict in verdicts if number < 14)
+        found = [((number - 14 + share) * SETTINGS.hop_s, [one.name for one in v.changed]) for number, v in verdicts]
+        assert all(names in ([], [name]) for _, names in found)
+        named_s.append(min((delay_s for delay_s, names in found if names), default=np.inf))
+    assert np.quantile(named_s, 0.95) <= (within_s or 2 * fixed_length_s(name, change))
 
 
 def test_a_small_change_accumulates_over_windows() -> None:
@@ -157,21 +159,15 @@ def test_a_change_before_the_first_data_is_dated_to_their_start() -> None:
         ] * len(verdicts)
 
 
-def test_a_repair_is_noticed_within_seconds() -> None:
-    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 5), (20, true()), (30, true(k_by=-0.25)), (20, true()))
-    late = [verdict for number, verdict in verdicts if number >= 50 + 4]
-    assert all(not verdict.changed for verdict in late)
-    assert not late[0].settled
-    (k_by,) = (reading for reading in late[0].current if reading.name == "k_by")
-    assert abs(k_by.relative_change or 1.0) < 0.04
-
-
-def test_readings_reach_the_new_value_while_the_window_spans_the_change() -> None:
-    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 6), (20, true()), (6, true(k_by=-0.25)))
-    last = verdicts[-1][1]
-    (k_by,) = (reading for reading in last.current if reading.name == "k_by")
-    assert k_by.relative_change == pytest.approx(-0.25, abs=0.03)
-    assert not last.settled
+def test_readings_follow_a_change_and_its_repair_within_seconds() -> None:
+    """While the window still spans both values."""
+    story = ((20, true()), (30, true(k_by=-0.25)), (20, true()))
+    verdicts = dict(play(SequentialTest(SETTINGS), gaussian(SEED + 5), *story))
+    for number, change in ((25, -0.25), (54, 0.0)):
+        assert not verdicts[number].settled
+        (k_by,) = (reading for reading in verdicts[number].current if reading.name == "k_by")
+        assert k_by.relative_change == pytest.approx(change, abs=0.03)
+    assert not any(verdict.changed for number, verdict in verdicts.items() if number >= 54)
 
 
 def test_intervals_of_a_window_across_a_change_hold_the_truth() -> None:
@@ -199,7 +195,7 @@ def test_intervals_of_a_window_across_a_change_hold_the_truth() -> None:
     assert sum(dates) >= 34
 
 
-@pytest.mark.parametrize("error", [0.002, 0.0002])
+@pytest.mark.parametrize("error", [pytest.param(0.002, marks=pytest.mark.long), 0.0002])
 def test_a_precisely_read_change_within_a_hop_keeps_its_size(error: float) -> None:
     """It comes at any moment within a hop; one to eight hops later its size is read within its errors."""
     inside = []
@@ -252,15 +248,6 @@ def test_a_change_too_small_to_be_named_is_not_fixed_at_zero() -> None:
         nominal += low <= -0.3 <= high
     assert alone > 75
     assert held >= 70 > 20 > nominal  # the probability that the other changed differs between windows
-
-
-def test_a_large_misfit_is_outside_the_model() -> None:
-    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 7)
-    for misfit, outside in [(1.0, False), (8.0, True)]:
-        for _ in range(20):
-            looks = {h: replace(look, misfit_z=misfit) for h, look in hops.looks(true()).items()}
-            if looks:
-                assert test.update(looks).outside_model == outside
 
 
 def test_a_foreign_cause_that_one_parameter_rivals_is_not_outside_the_model() -> None:
@@ -357,17 +344,14 @@ def test_window_rate_is_kept_over_all_parameters(rate: float) -> None:
     assert abs(counted - expected) < 4 * expected**0.5
 
 
-def moving_averages(hops: int, overlap: int, seed: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    total = np.concatenate([[0.0], np.cumsum(np.random.default_rng(seed).standard_normal(hops + overlap - 1))])
-    return np.asarray((total[overlap:] - total[:-overlap]) / overlap**0.5)
-
-
 @pytest.mark.parametrize("overlap", [2, 12, 192, *(pytest.param(n, marks=pytest.mark.long) for n in (4, 48))])
 @pytest.mark.parametrize("threshold", [3.0, 3.6])
 def test_new_crossings_of_a_sliding_window_have_the_expected_rate(overlap: int, threshold: float) -> None:
     """Four million hops; an exceedance is new if none came in the window's length before it."""
     hops = 4_000_000
-    above = np.flatnonzero(np.abs(moving_averages(hops, overlap, SEED_OF_CALIBRATION + overlap)) > threshold)
+    noise = np.random.default_rng(SEED_OF_CALIBRATION + overlap).standard_normal(hops + overlap - 1)
+    total = np.concatenate([[0.0], np.cumsum(noise)])
+    above = np.flatnonzero(np.abs(total[overlap:] - total[:-overlap]) / overlap**0.5 > threshold)
     fresh = 1 + int((np.diff(above) > overlap).sum())
     expected = 2 * crossing_rate(threshold, overlap) * hops
     # The rate is asymptotic in the threshold; crossings of one window's noise sometimes come in two groups.

@@ -87,10 +87,9 @@ def renewed(
 @pytest.mark.parametrize(
     ("machine", "recorded"),
     [
-        ("phase reference", True),
         ("no phase reference", False),
         pytest.param("phase reference", False, marks=pytest.mark.long),
-        pytest.param("no phase reference", True, marks=pytest.mark.long),
+        *(pytest.param(machine, True, marks=pytest.mark.long) for machine in MACHINES),
     ],
 )
 def test_a_monitor_stopped_at_any_block_continues_bit_for_bit(machine: str, recorded: bool) -> None:

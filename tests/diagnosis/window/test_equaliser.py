@@ -13,10 +13,9 @@ from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests.sure import sure
-from tests.windows import fed, statistics
+from tests.windows import fed, healthy_samples, statistics
 
 # Velocities behind geophones and AC-coupled inputs; channels one after the other.
 SIGNAL: dict[str, dict[str, Any]] = {
@@ -39,11 +38,8 @@ def machine(*, declared: bool, without_angle: bool = False) -> Machine:
 
 @cache
 def simulated(*, declared: bool = False, speed_rpm: float | None = None) -> FloatArray:
-    scenario, _ = load_scenario("healthy")
     changes = () if speed_rpm is None else (Event(at_s=30, speed_rpm=speed_rpm),)
-    scenario = scenario.overridden(duration_s=64.0, seed=31_301, faults=changes)
-    made = blocks(scenario, machine(declared=declared), 1.0)
-    return np.concatenate([block.samples for block, _ in made])
+    return healthy_samples(machine(declared=declared), 64.0, 31_301, *changes)
 
 
 def behind_sensors(samples: FloatArray) -> FloatArray:
@@ -85,9 +81,7 @@ def test_declared_responses_are_corrected_in_a_window(without_angle: bool, speed
 
 
 def test_the_latest_hops_have_the_same_news_behind_declared_responses() -> None:
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=64.0, seed=31_302)
-    samples = np.concatenate([block.samples for block, _ in blocks(scenario, machine(declared=False), 1.0)])
+    samples = healthy_samples(machine(declared=False), 64.0, 31_302)
     for of, seen in ((machine(declared=False), samples), (machine(declared=True), behind_sensors(samples))):
         sliding, fits = fed(plan_for(of), seen), LengthFits(of)
         window = sure(sliding.statistics())

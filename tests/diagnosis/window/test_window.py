@@ -307,17 +307,13 @@ def without_angle(plan: Plan) -> Plan:
 def test_readings_stay_unbiased_across_the_flank_of_a_resonance() -> None:
     """A rise of 15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
     plan = without_angle(plan_for(LAB, lagged=False))
-    z, misfit = [], []
-    for seed in (40, 41):
-        (window,) = feed(SlidingWindow(plan), run_of_lab(seed, 0.15)[:, :-1])
-        assert window.removed_by_hop
-        assert window.speed_source == "estimated"
-        assert window.speed_range[1] / window.speed_range[0] > 1.12
-        diagnosis = LikelihoodFit(LAB).diagnose(window)
-        z.append([reading.z for reading in diagnosis.parameters[:4]])
-        misfit.append(diagnosis.misfit_z)
-    assert np.all(np.abs(np.mean(np.array(z, dtype=float), axis=0)) < 3 / np.sqrt(2)), z
-    assert np.all(np.array(misfit, dtype=float) < 4), misfit
+    (window,) = feed(SlidingWindow(plan), run_of_lab(40, 0.15)[:, :-1])
+    assert window.removed_by_hop
+    assert window.speed_source == "estimated"
+    assert window.speed_range[1] / window.speed_range[0] > 1.12
+    diagnosis = LikelihoodFit(LAB).diagnose(window)
+    assert all(abs(sure(reading.z)) < 3 for reading in diagnosis.parameters[:4])
+    assert sure(diagnosis.misfit_z) < 4
 
 
 @pytest.mark.slow
