@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from service.api.routes.replays import ReplayRequests
 from service.delivery.event_feed import EventFeed
-from service.delivery.metrics.collector import MeasuredService, Metrics
+from service.delivery.metrics import MeasuredService, Metrics
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.settings.service import ServiceSettings

@@ -34,7 +34,7 @@ def test(
 
     [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
     """
-    from service.delivery.webhooks.webhooks import send_test  # noqa: PLC0415
+    from service.delivery.webhooks.dispatcher import send_test  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
     webhooks = load_settings(config).webhooks

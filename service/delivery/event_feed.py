@@ -136,8 +136,7 @@ class EventFeed:
             self._number += 1
             self._health.pop(place, None)
             self._health[place] = _Said(self._number, health)
-            for listener in self._listeners:
-                listener.wake()
+            self.wake()
 
     def close(self) -> None:
         """End every stream once it has sent what is committed; slow readers are waited for `_LAST_S` at most."""
