@@ -37,23 +37,14 @@ class PresentedToken:
 
 
 def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | None = None) -> tuple[TokenRecord, str]:
-    """Make a token.
+    """Make a token: the record that is stored, and its text, which cannot be retrieved again.
 
     Parameters
     ----------
     name : str
         Who uses it, as the audit log shall say: at most 64 printable characters.
-    scopes : iterable of Scope
-        What it is good for, at least one.
     days : int, optional
         How long it holds; for ever if left out.
-
-    Returns
-    -------
-    record : TokenRecord
-        What is stored.
-    text : str
-        The token. It cannot be retrieved again.
 
     Raises
     ------

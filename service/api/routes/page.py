@@ -15,8 +15,7 @@ from fastapi import FastAPI, HTTPException, Response
 from fastapi import Path as InPath
 from fastapi.responses import FileResponse, HTMLResponse
 
-from service.access.guard import Guard
-from service.access.requirement import PAGE_FILES
+from service.access.guard import PAGE_FILES, Guard
 
 _FOLDER = Path(str(files("service"))) / "api" / "page"
 _INDEX = "index.html"
