@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 
 import structlog
-from sqlalchemy import Connection, Table, delete, func, select, text, update
+from sqlalchemy import Connection, Table, delete, func, select, update
 
 from service.history.age import AgeClock
 from service.history.database import Database
@@ -40,13 +40,7 @@ class Reduction:
         self._thread.join(self._database.answer_s)
 
     def run(self, now_ns: int) -> Dropped:
-        """Drop what is too old at a time of the computer, readings once they are in buckets; runs every few minutes.
-
-        Raises
-        ------
-        StoreError
-            If the database fails.
-        """
+        """Drop what is too old at a time of the computer, readings once they are in buckets; runs every few minutes."""
         kept = self._retention
         with self._turn:
             return Dropped(
@@ -75,10 +69,8 @@ class Reduction:
 
     def _batch(self, table: Table, until_ns: int) -> int:
         with self._database.writing() as connection:
-            if not self._database.is_sqlite:
-                lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
-                if not connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
-                    return 0  # another monitor is at it
+            if not (self._database.is_sqlite or connection.scalar(select(func.pg_try_advisory_xact_lock(*_LOCK)))):
+                return 0  # another monitor is at it
             if table is not buckets:
                 numbers = connection.scalars(select(machines.c.machine_id).order_by(machines.c.machine_id)).all()
                 most = max(1, _BATCH // max(1, len(numbers)))

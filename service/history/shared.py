@@ -1,5 +1,6 @@
 """What belongs to no single machine: tokens, audit log, cursors of webhooks; and alarms and reports to read."""
 
+from dataclasses import asdict
 from typing import Any
 
 from sqlalchemy import func, insert, select, update
@@ -16,13 +17,7 @@ _TIMEOUT_S = 5.0
 
 
 def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """The latest events committed to a machine's log since a time of recording, at most 10 000, in order.
-
-    Raises
-    ------
-    StoreError
-        If the database fails.
-    """
+    """The latest events committed to a machine's log since a time of recording, at most 10 000, in order."""
     log = alarm_events.c
     query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
     query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
@@ -33,10 +28,7 @@ def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> 
 def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
     """`alarms_since` of a history that another program writes: it is opened read-only and closed again.
 
-    Raises
-    ------
-    StoreError
-        If there is no such history, or it cannot be read.
+    Raises StoreError if there is no such history, or it cannot be read.
     """
     database = Database(url, _TIMEOUT_S)
     database.start(read_only=True)
@@ -55,9 +47,8 @@ class ReportLog:
 
     def span_ns(self) -> tuple[int, int] | None:
         """When the oldest and the newest window end; None if there are no reports."""
-        ((first, last),) = self._database.rows(
-            select(func.min(reports.c.end_ns), func.max(reports.c.end_ns)).where(*self._own)
-        )
+        query = select(func.min(reports.c.end_ns), func.max(reports.c.end_ns)).where(*self._own)
+        ((first, last),) = self._database.rows(query)
         return None if first is None else (first, last)
 
     def texts(self, since_ns: int, until_ns: int, most: int) -> list[str]:
@@ -86,9 +77,7 @@ class AuditLog:
         storable = {name: _storable(text) for name, text in texts.items()}
         entry = insert(audit_log).values(at_ns=at_ns, status=status, **storable)
         with self._database.writing() as connection:
-            made = connection.execute(entry.returning(audit_log.c.number))
-            number: int = made.scalar_one()
-        return number
+            return connection.execute(entry.returning(audit_log.c.number)).scalar_one()
 
     def entries(
         self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
@@ -102,10 +91,8 @@ class AuditLog:
         query = select(*_ENTRY).order_by(audit_log.c.number.desc()).limit(limit)
         if before is not None:
             query = query.where(audit_log.c.number < before)
-        if machine is not None:
-            query = query.where(audit_log.c.machine == machine)
-        if actor is not None:
-            query = query.where(audit_log.c.actor == actor)
+        for column, value in ((audit_log.c.machine, machine), (audit_log.c.actor, actor)):
+            query = query if value is None else query.where(column == value)
         return tuple(AuditRecord.model_validate(dict(row._mapping)) for row in self._database.rows(query))
 
 
@@ -124,17 +111,10 @@ class TokenStore:
         self._database = database
 
     def add(self, record: TokenRecord) -> None:
-        """Keep a new token.
-
-        Raises
-        ------
-        StoreError
-            If a scope holds a blank, or there is a token with this identifier.
-        """
+        """Keep a new token; StoreError if a scope holds a blank, or there is a token with this identifier."""
         if any(not scope or scope.split() != [scope] for scope in record.scopes):
             raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
-        values = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
-        values["scopes"] = " ".join(record.scopes)
+        values = asdict(record) | {"scopes": " ".join(record.scopes)}
         with self._database.writing() as connection:
             there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)
             if connection.scalar(there) is not None:
