@@ -5,9 +5,6 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-REQUEST = ConfigDict(extra="forbid", frozen=True)
-"""Configuration of requests to a monitor: unknown fields are refused as mistakes."""
-
 EXAMPLE_NS = 1767225805000000000
 
 
@@ -15,6 +12,12 @@ class Record(BaseModel):
     """Base class of published records; unknown fields, such as those of a later version, are ignored."""
 
     model_config = ConfigDict(frozen=True, json_schema_serialization_defaults_required=True)
+
+
+class Request(BaseModel):
+    """Base class of requests to a monitor; unknown fields are refused as mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def finite(value: float | None) -> float | None:
