@@ -4,7 +4,7 @@ from difflib import SequenceMatcher
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import Body, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import iter_route_contexts
@@ -73,6 +73,11 @@ def responses(
 def written(model: type[BaseModel], *problems: int) -> dict[str, Any]:
     """Arguments that let OpenAPI describe a route whose answer is JSON text before FastAPI sees it."""
     return {"responses": responses(model, *problems), "response_model": model}
+
+
+def shown_body(summary: str, value: object) -> Any:
+    """Body of a request, described in OpenAPI by an example."""
+    return Body(openapi_examples={"example": {"summary": summary, "value": value}})
 
 
 def problem_responses(*problems: int, guarded: bool = True) -> dict[int | str, dict[str, Any]]:

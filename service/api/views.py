@@ -58,13 +58,7 @@ class ServiceView(MeasuredService, Protocol):
 
 
 def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
-    """Find a machine.
-
-    Raises
-    ------
-    HTTPException
-        404, with a list of the machines.
-    """
+    """Find a machine; HTTPException 404, with a list of the machines, if there is none of this name."""
     machines = {one.machine.title: one for one in service.machines()}
     machine = machines.get(f"{site}/{name}")
     if machine is None:
@@ -73,13 +67,7 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
 
 
 def check_alarm(view: Monitored, name: str, status: int) -> None:
-    """Refuse an alarm that a machine cannot have.
-
-    Raises
-    ------
-    HTTPException
-        With the given status, and a list of the machine's alarms.
-    """
+    """Refuse an alarm that a machine cannot have; HTTPException with this status, and a list of those it can have."""
     levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
     if name not in ALARMS and name not in levels:
         there = ", ".join((*ALARMS, *levels))

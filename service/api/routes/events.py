@@ -55,24 +55,20 @@ _InFull = Annotated[
 ]
 
 
-def stream_example() -> str:
-    """Example of a stream of server-sent events."""
+def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the route."""
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
-    return (
+    stream = (
         "retry: 2000\nid: demo/lab=-1\nevent: start\ndata: {}\n\n"
         f"id: demo/lab=0\nevent: alarm\ndata: {event.model_dump_json()}\n\n"
     )
-
-
-def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
-    """Add the route."""
 
     @app.get(
         "/api/v1/events",
         tags=["events"],
         response_class=StreamingResponse,
         responses={
-            200: {"content": {"text/event-stream": {"schema": {"type": "string"}, "example": stream_example()}}},
+            200: {"content": {"text/event-stream": {"schema": {"type": "string"}, "example": stream}}},
             **problem_responses(404, 409, 422),
         },
     )

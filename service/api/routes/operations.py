@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
+from fastapi import FastAPI, Header, HTTPException, Path, Query, Request, Response
 
 from models.errors import RotorwatchError
 from models.mistakes import form
@@ -20,7 +20,7 @@ from rotorwatch.records.operations import (
 )
 from service.access.audit import AuditNote
 from service.access.guard import Guard
-from service.access.problems import responses
+from service.access.problems import responses, shown_body
 from service.access.scopes import Caller
 from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, check_alarm, found_machine
 from service.monitor.alarm_conversion import alarm_entries
@@ -75,12 +75,6 @@ _IfMatch = Annotated[
 
 def add_operation_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     """Add the routes; those of alarm events must be added before, or ``events`` would be taken for an alarm's name."""
-    _add_reading_routes(app, service, guard)
-    for kind in _TEXTS:
-        _add_operation(app, service, guard, kind)
-
-
-def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["alarms"], "dependencies": [guard.read]}
 
     @app.get(f"{PLACE}/alarms", responses=responses(AlarmStates, 404, 422), **common)
@@ -107,11 +101,13 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         """One alarm; the header ETag has its version."""
         return _marked(_present(found_machine(service, site, machine), name), response)
 
+    for kind in _TEXTS:
+        _add_operation(app, service, guard, kind)
+
 
 def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: OperationKind) -> None:
     configures = kind in ("remove-from-service", "return-to-service")
     model: Any = _ORDERS.get(kind, OperationOrder)
-    shown = {"example": {"summary": "as seen in the control room", "value": example(model)}}
 
     @app.post(
         f"{PLACE}/alarms/{{name}}/{kind}",
@@ -129,7 +125,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         machine: MachineName,
         name: _Alarm,
         caller: Annotated[Caller, guard.configure if configures else guard.operate],
-        posted: Annotated[model, Body(openapi_examples=shown)],
+        posted: Annotated[model, shown_body("as seen in the control room", example(model))],
         if_match: _IfMatch = None,
     ) -> OperationDone:
         order: _Order = posted
