@@ -82,13 +82,7 @@ class Requirement:
     scope: Scope
 
     def __call__(self, request: Request) -> Caller:
-        """Return the caller.
-
-        Raises
-        ------
-        HTTPException
-            401 without a caller, 403 if the scope is missing.
-        """
+        """Return the caller; HTTPException 401 without one, 403 if the scope is missing."""
         caller = getattr(request.state, CALLER, None)
         if not isinstance(caller, Caller):  # the request did not pass the middleware
             raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
@@ -209,10 +203,9 @@ class Guard:
         def written() -> bytes:
             return bytes(JSONResponse(app.openapi()).body)
 
-        outside = unguarded_routes(app, self.pass_gate)
-        if outside:
+        if outside := self._unguarded_routes(app):
             raise AccessError(
-                f"{', '.join(outside)}: the gate does not stand before this; build the application with "
+                f"{outside}: the gate does not stand before this; build the application with "
                 "FastAPI(dependencies=[guard.gate], openapi_url=None, docs_url=None, redoc_url=None), and add nothing "
                 "but its own routes"
             )
@@ -221,16 +214,10 @@ class Guard:
         )
 
     async def admit(self, request: Request) -> Caller:
-        """Identify the caller, and refuse a request for its token, rate or origin.
-
-        Raises
-        ------
-        HTTPException
-            401, 403, 429 or 503.
-        """
+        """Identify the caller; HTTPException 401, 403, 429 or 503 for the token, rate or origin of a request."""
         address = address_of(request)
-        if outside := unguarded_routes(request.app, self.pass_gate):  # one that was added since `protect`
-            raise HTTPException(403, f"{', '.join(outside)}: declares no scope, so nothing is served")
+        if outside := self._unguarded_routes(request.app):  # one that was added since `protect`
+            raise HTTPException(403, f"{outside}: declares no scope, so nothing is served")
         if _is_public(request):
             caller: Caller | None = Caller(NOBODY, address=address)
         elif self.access.open_on_loopback:
@@ -270,6 +257,16 @@ class Guard:
             self.trail.start(visit)
         except RotorwatchError as error:
             raise HTTPException(503, f"nothing was done, because the audit log cannot be written: {error}") from error
+
+    def _unguarded_routes(self, app: FastAPI) -> str:
+        """Routes that are not behind the gate: static files, sockets, mounted programs, or routes without it."""
+        outside = sorted(
+            _title(context)
+            for context in iter_route_contexts(app.routes)
+            if not isinstance(context.original_route, APIRoute)
+            or not any(inner.call == self.pass_gate for inner in context.dependant.dependencies)
+        )
+        return ", ".join(outside)
 
     def still_valid(self, caller: Caller) -> bool:
         """Whether a caller's token still holds, for streams that stay open for long; may wait for a database."""
@@ -345,16 +342,6 @@ def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozen
                 return frozenset()
             found |= declared
     return frozenset(found)
-
-
-def unguarded_routes(app: FastAPI, gate: Callable[..., Any]) -> list[str]:
-    """Routes that are not behind `gate`: static files, sockets, mounted programs, or routes without it."""
-    return sorted(
-        _title(context)
-        for context in iter_route_contexts(app.routes)
-        if not isinstance(context.original_route, APIRoute)
-        or not any(inner.call == gate for inner in context.dependant.dependencies)
-    )
 
 
 def _required(dependant: Dependant) -> set[Scope]:

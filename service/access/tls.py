@@ -14,13 +14,7 @@ _SOON_S = 30 * 86_400.0
 
 
 def server_arguments(access: AccessSettings) -> dict[str, Any]:
-    """Keyword arguments of ``uvicorn.Config`` that belong to access.
-
-    Raises
-    ------
-    MachineFileError
-        If certificate or key cannot be used.
-    """
+    """Keyword arguments of ``uvicorn.Config`` that belong to access; raises as `tls_context` does."""
     arguments: dict[str, Any] = {
         # Only named proxies: anybody else could write any address into the audit log.
         "proxy_headers": bool(access.proxies),

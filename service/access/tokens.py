@@ -84,13 +84,7 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
 
 
 def check_name_is_free(name: str, there: Iterable[TokenRecord], now_ns: int) -> None:
-    """Refuse a name that the audit log could not tell from another one.
-
-    Raises
-    ------
-    NameTakenError
-        If one of the tokens that are there is valid and has the name.
-    """
+    """Refuse, with NameTakenError, the name of a valid token: the audit log could not tell the two apart."""
     if any(one.name == name and token_state(one, now_ns) == "valid" for one in there):
         raise NameTakenError(f"a token of {name!r} is already valid: choose another name, or revoke it first")
 

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Generic, Literal, Protocol, TypeVar
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric, SummaryMetricFamily
@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from rotorwatch import __version__
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
 from rotorwatch.records.health import Health, HealthState
-from rotorwatch.records.monitor import Readiness, WebhookList
+from rotorwatch.records.monitor import Readiness, WebhookStatus
 from service.delivery.webhooks.dispatcher import Webhooks
 from service.history.records import StoreError
 from service.recordings.recorder import RecorderStatus
@@ -109,40 +109,32 @@ class Observed:
 
 
 _Values = Iterable[tuple[tuple[str, ...], float]]
+_Of = TypeVar("_Of")
 
 
 @dataclass(frozen=True, slots=True)
-class _Family:
-    """One metric of every machine; `values` gives labels beyond the place, and numbers."""
+class _Family(Generic[_Of]):
+    """One metric of every machine or webhook; `values` gives a number, or none, or one for each value of `labels`."""
 
     kind: Literal["gauge", "counter"]
     name: str
     text: str
-    values: Callable[[Observed], _Values]
+    values: Callable[[_Of], _Values | float | None]
     labels: tuple[str, ...] = ()
 
-    def metric(self, machines: Sequence[Observed]) -> Metric:
-        labels = (*_PLACE, *self.labels)
+    def metric(self, place: tuple[str, ...], subjects: Sequence[tuple[tuple[str, ...], _Of]]) -> Metric:
+        """The metric, with the labels `place`, whose values stand beside each subject."""
         build = GaugeMetricFamily if self.kind == "gauge" else CounterMetricFamily
-        family = build(f"rotorwatch_{self.name}", self.text, labels=labels)
-        for machine in machines:
-            for more, value in self.values(machine):
-                family.add_metric((*machine.place, *more), value)
+        family = build(f"rotorwatch_{self.name}", self.text, labels=(*place, *self.labels))
+        for where, subject in subjects:
+            if (found := self.values(subject)) is not None:
+                for more, value in found if isinstance(found, Iterable) else [((), found)]:
+                    family.add_metric((*where, *more), value)
         return family
 
 
-def _one(number: Callable[[Observed], float | None]) -> Callable[[Observed], _Values]:
-    """A single number, or none."""
-
-    def values(machine: Observed) -> _Values:
-        value = number(machine)
-        return () if value is None else (((), value),)
-
-    return values
-
-
-def _recorded(number: Callable[[RecorderStatus], float]) -> Callable[[Observed], _Values]:
-    return _one(lambda machine: None if machine.status.recorder is None else number(machine.status.recorder))
+def _recorded(number: Callable[[RecorderStatus], float]) -> Callable[[Observed], float | None]:
+    return lambda machine: None if machine.status.recorder is None else number(machine.status.recorder)
 
 
 def _state(machine: Observed) -> _Values:
@@ -179,56 +171,55 @@ def _levels(machine: Observed) -> _Values:
     )
 
 
-_FAMILIES = (
+_FAMILIES: tuple[_Family[Observed], ...] = (
     _Family("gauge", "machine_state", "1 for the state of health the machine is in, 0 for others", _state, ("state",)),
     _Family("gauge", "publisher_alive", "1 if a publisher of the stream is there",
-            _one(lambda machine: machine.health.stream.publisher_alive)),
+            lambda machine: machine.health.stream.publisher_alive),
     _Family("gauge", "stream_silent", "1 if no usable block has come for longer than a silence may last",
-            _one(lambda machine: machine.health.stream.silent)),
+            lambda machine: machine.health.stream.silent),
     _Family("gauge", "data_age_seconds", "Time since the last accepted block was processed; missing before the first",
-            _one(lambda machine: machine.health.stream.data_age_s)),
+            lambda machine: machine.health.stream.data_age_s),
     _Family("counter", "blocks_accepted_total", "Blocks accepted",
-            _one(lambda machine: machine.health.quality.accepted_blocks)),
+            lambda machine: machine.health.quality.accepted_blocks),
     _Family("counter", "blocks_refused_total", "Blocks refused, by reason",
             lambda machine: (((why,), n) for why, n in machine.health.quality.refused_blocks.items()), ("reason",)),
     _Family("counter", "data_seconds_total", "Length of the data accepted",
-            _one(lambda machine: machine.status.tally.data_s)),
-    _Family("counter", "gaps_total", "Interruptions of the stream", _one(lambda machine: machine.health.quality.gaps)),
+            lambda machine: machine.status.tally.data_s),
+    _Family("counter", "gaps_total", "Interruptions of the stream", lambda machine: machine.health.quality.gaps),
     _Family("counter", "missing_seconds_total", "Length of the data that the gaps cost",
-            _one(lambda machine: machine.health.quality.missing_s)),
+            lambda machine: machine.health.quality.missing_s),
     _Family("gauge", "queue_blocks", "Blocks that have arrived and wait for evaluation",
-            _one(lambda machine: machine.status.queue_blocks)),
-    _Family("gauge", "lag_seconds", "Length of the data that have arrived and wait for evaluation", _one(_lag_s)),
+            lambda machine: machine.status.queue_blocks),
+    _Family("gauge", "lag_seconds", "Length of the data that have arrived and wait for evaluation", _lag_s),
     _Family("counter", "queue_dropped_blocks_total", "Blocks dropped because the monitor could not keep up",
-            _one(lambda machine: machine.health.quality.queue_dropped_blocks)),
+            lambda machine: machine.health.quality.queue_dropped_blocks),
     _Family("counter", "link_missed_blocks_total", "Blocks lost on the way, as far as the link knows",
-            _one(lambda machine: machine.health.quality.link_missed_blocks)),
+            lambda machine: machine.health.quality.link_missed_blocks),
     _Family("gauge", "window_filled_ratio", "Fraction of a full window that is there",
-            _one(lambda machine: machine.health.filled)),
-    _Family("counter", "windows_total", "Windows evaluated", _one(lambda machine: machine.status.tally.windows)),
+            lambda machine: machine.health.filled),
+    _Family("counter", "windows_total", "Windows evaluated", lambda machine: machine.status.tally.windows),
     _Family("counter", "windows_skipped_total", "Windows not evaluated because the monitor could not keep up",
-            _one(lambda machine: machine.health.quality.skipped_windows)),
+            lambda machine: machine.health.quality.skipped_windows),
     _Family("counter", "commit_seconds_total", "Time spent waiting for the history",
-            _one(lambda machine: machine.status.tally.commit_s)),
+            lambda machine: machine.status.tally.commit_s),
     _Family("gauge", "history_waiting_steps", "Steps that are not in the history yet",
-            _one(lambda machine: machine.status.history_waiting)),
+            lambda machine: machine.status.history_waiting),
     _Family("gauge", "worker_alive", "1 if the thread that evaluates the blocks runs",
-            _one(lambda machine: machine.status.alive)),
+            lambda machine: machine.status.alive),
     _Family("gauge", "worker_busy_seconds", "How long that thread has been at work on the same block",
-            _one(lambda machine: machine.status.busy_s)),
+            lambda machine: machine.status.busy_s),
     _Family("counter", "worker_errors_total", "Blocks lost to an error inside the monitor",
-            _one(lambda machine: machine.status.errors)),
+            lambda machine: machine.status.errors),
     _Family("gauge", "restored_at_start", "1 if the monitor resumed from where it stood before its latest start",
-            _one(lambda machine: machine.status.restart.startswith("resumed"))),
+            lambda machine: machine.status.restart.startswith("resumed")),
     _Family("gauge", "level", "Vibration levels of the latest window, in the unit of the channel", _levels,
             ("channel", "measure", "unit")),
     _Family("gauge", "alarms", "Alarms that are not normal", _alarms, ("state", "severity")),
     _Family("counter", "alarm_events_total", "Alarm events in the history since the start, by kind",
             lambda machine: (((kind.value,), machine.events.get(kind.value, 0)) for kind in EventKind), ("kind",)),
     _Family("gauge", "alarm_sequence", "Number of the latest alarm event, -1 before the first; goes on across restarts",
-            _one(lambda machine: machine.monitored.history.last_sequence())),
-    _Family("gauge", "recorder_state", "1 for the state the recorder is in, 0 for others", _recorder_state,
-            ("state",)),
+            lambda machine: machine.monitored.history.last_sequence()),
+    _Family("gauge", "recorder_state", "1 for the state the recorder is in, 0 for others", _recorder_state, ("state",)),
     _Family("counter", "recorder_received_messages_total", "Messages that arrived at the recorder",
             _recorded(lambda recorder: recorder.received)),
     _Family("counter", "recorder_dropped_messages_total", "Messages the recorder threw away: its queue was full",
@@ -237,6 +228,17 @@ _FAMILIES = (
             _recorded(lambda recorder: recorder.lost)),
     _Family("counter", "recorder_failures_total", "Attempts at writing a recording that failed",
             _recorded(lambda recorder: recorder.failures)),
+)  # fmt: skip
+_WEBHOOK_FAMILIES: tuple[_Family[WebhookStatus], ...] = (
+    _Family("gauge", "webhook_state", "1 for the state the webhook is in, 0 for others",
+            lambda webhook: (((state,), float(state == webhook.state)) for state in _WEBHOOK_STATES), ("state",)),
+    _Family("gauge", "webhook_pending_events", "Alarm events after the last one delivered",
+            lambda webhook: webhook.pending),
+    _Family("counter", "webhook_delivered_events_total", "Events delivered", lambda webhook: webhook.delivered),
+    _Family("counter", "webhook_failed_attempts_total", "Attempts that failed",
+            lambda webhook: webhook.failed_attempts),
+    _Family("gauge", "webhook_delivery_timestamp_seconds", "When an event was last delivered",
+            lambda webhook: None if webhook.last_delivered_ns is None else webhook.last_delivered_ns / 1e9),
 )  # fmt: skip
 
 
@@ -252,8 +254,8 @@ def machine_families(machines: Sequence[Observed]) -> Iterator[Metric]:
         steps.add_metric(machine.place, tally.blocks, tally.step_s)
     yield info
     yield steps
-    for family in _FAMILIES:
-        yield family.metric(machines)
+    subjects = [(machine.place, machine) for machine in machines]
+    yield from (family.metric(_PLACE, subjects) for family in _FAMILIES)
 
 
 class MeasuredService(Protocol):
@@ -295,7 +297,8 @@ class Metrics:
         observed = [Observed(one, one.health(), one.status(), self._counted(one)) for one in self._service.machines()]
         yield from machine_families(observed)
         yield from _service_families(readiness)
-        yield from _webhook_families(self._service.webhooks.statuses())
+        webhooks = [((one.name,), one) for one in self._service.webhooks.statuses().webhooks]
+        yield from (family.metric(("webhook",), webhooks) for family in _WEBHOOK_FAMILIES)
         yield from self._http_families()
 
     def _counted(self, machine: Monitored) -> Counter[str]:
@@ -335,27 +338,3 @@ def _service_families(readiness: Readiness) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "rotorwatch_history_failing", "1 if the history cannot be written", value=bool(readiness.history_trouble)
     )
-
-
-def _webhook_families(webhooks: WebhookList) -> Iterator[Metric]:
-    labels = ("webhook",)
-    state = GaugeMetricFamily(
-        "rotorwatch_webhook_state", "1 for the state the webhook is in, 0 for others", labels=("webhook", "state")
-    )
-    pending = GaugeMetricFamily(
-        "rotorwatch_webhook_pending_events", "Alarm events after the last one delivered", labels=labels
-    )
-    delivered = CounterMetricFamily("rotorwatch_webhook_delivered_events_total", "Events delivered", labels=labels)
-    failed = CounterMetricFamily("rotorwatch_webhook_failed_attempts_total", "Attempts that failed", labels=labels)
-    latest = GaugeMetricFamily(
-        "rotorwatch_webhook_delivery_timestamp_seconds", "When an event was last delivered", labels=labels
-    )
-    for webhook in webhooks.webhooks:
-        for each in _WEBHOOK_STATES:
-            state.add_metric((webhook.name, each), each == webhook.state)
-        pending.add_metric((webhook.name,), webhook.pending)
-        delivered.add_metric((webhook.name,), webhook.delivered)
-        failed.add_metric((webhook.name,), webhook.failed_attempts)
-        if webhook.last_delivered_ns is not None:
-            latest.add_metric((webhook.name,), webhook.last_delivered_ns / 1e9)
-    yield from (state, pending, delivered, failed, latest)

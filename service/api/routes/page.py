@@ -18,7 +18,6 @@ from fastapi.responses import FileResponse, HTMLResponse
 from service.access.guard import PAGE_FILES, Guard
 
 _FOLDER = Path(str(files("service"))) / "api" / "page"
-_INDEX = "index.html"
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
 _CHARTS = ("uPlot.iife.js", "uPlot.min.css")
 _POLICY = (
@@ -55,7 +54,7 @@ def add_page_routes(app: FastAPI) -> None:
     """Add the page and the files that it loads."""
     found = page_files()
     digest = hashlib.sha256(repr(found).encode()).hexdigest()[:16]
-    index = (_FOLDER / _INDEX).read_text(encoding="utf-8").replace(PAGE_FILES, f"{PAGE_FILES}{digest}/")
+    index = (_FOLDER / "index.html").read_text(encoding="utf-8").replace(PAGE_FILES, f"{PAGE_FILES}{digest}/")
 
     @app.get("/", include_in_schema=False, response_class=HTMLResponse)
     def page() -> HTMLResponse:

@@ -189,14 +189,14 @@ class Dispatcher:
         if lane.next is None:
             saved = self._cursors.get(self.settings.name, lane.place)
             lane.next, lane.saved = (lane.newest + 1, -1) if saved < 0 else (saved, saved)
-        self._save(lane, lane.next)
+        self._save(lane)
         while not lane.waiting and lane.next <= lane.log.last_sequence():
             page = lane.log.events(after=lane.next - 1, limit=_PAGE)
             if not page:
                 break
             lane.waiting.extend(event for event in page if self._wants(event))
             lane.next = lane.waiting[0].sequence if lane.waiting else page[-1].sequence + 1
-            self._save(lane, lane.next)
+            self._save(lane)
         return lane.waiting[0] if lane.waiting else None
 
     def _wants(self, event: StoredEvent) -> bool:
@@ -240,15 +240,15 @@ class Dispatcher:
         lane.next = lane.waiting[0].sequence if lane.waiting else event.sequence + 1
         self._delivered += 1
         self._last_delivered_ns = self._now_ns()
-        self._save(lane, lane.next)
+        self._save(lane)
 
-    def _save(self, lane: _Lane, sequence: int) -> None:
+    def _save(self, lane: _Lane) -> None:
         """Remember how far a machine's events have come; if that fails, later: at worst some are delivered twice."""
-        if lane.saved == sequence or self._clock() < self._save_due_s:
+        if lane.next is None or lane.saved == lane.next or self._clock() < self._save_due_s:
             return
         try:
-            self._cursors.set(self.settings.name, lane.place, sequence)
-            lane.saved = sequence
+            self._cursors.set(self.settings.name, lane.place, lane.next)
+            lane.saved = lane.next
         except StoreError as error:
             self._save_due_s = self._clock() + _AGAIN_S
             self._note_store_error(error)
@@ -269,13 +269,7 @@ def _annunciated(event: StoredEvent) -> bool:
 
 
 class Webhooks:
-    """Starts and stops webhooks and reports their states.
-
-    Raises
-    ------
-    MachineFileError
-        If a secret or certificate cannot be used.
-    """
+    """Starts and stops webhooks and reports their states; MachineFileError if a secret or certificate is unusable."""
 
     def __init__(self, webhooks: Sequence[WebhookSettings]) -> None:
         self._receivers = [(settings, Receiver(settings)) for settings in webhooks]

@@ -185,12 +185,18 @@ class Receiver:
     async def _attempt(self, identifier: str, body: bytes) -> Answer:
         answer: Answer | None = None
         why = ""
+        timestamp_s = int(time.time())
+        headers = {
+            "content-type": CONTENT_TYPE,
+            "user-agent": f"rotorwatch/{__version__}",
+            "webhook-id": identifier,
+            "webhook-timestamp": str(timestamp_s),
+            "webhook-signature": signature(self._keys, identifier, timestamp_s, body),
+        }
         try:
             # For the attempt as a whole: httpx's own timeouts begin anew with every byte that comes in.
             async with asyncio.timeout(self._settings.timeout_s):
-                async with self._opened().stream(
-                    "POST", self._url, content=body, headers=self._headers(identifier, body)
-                ) as response:
+                async with self._opened().stream("POST", self._url, content=body, headers=headers) as response:
                     answer = answer_of(response.status_code, response.headers, time.time())
                     await _drained(response)
         except TimeoutError:
@@ -215,16 +221,6 @@ class Receiver:
             )
         return self._client
 
-    def _headers(self, identifier: str, body: bytes) -> dict[str, str]:
-        timestamp_s = int(time.time())
-        return {
-            "content-type": CONTENT_TYPE,
-            "user-agent": f"rotorwatch/{__version__}",
-            "webhook-id": identifier,
-            "webhook-timestamp": str(timestamp_s),
-            "webhook-signature": signature(self._keys, identifier, timestamp_s, body),
-        }
-
 
 async def _drained(response: httpx.Response) -> None:
     """Read and discard the rest of a short answer, so that the connection can be used again."""
@@ -240,11 +236,7 @@ def _trusted(settings: WebhookSettings, environment: bool) -> ssl.SSLContext:
         return httpx.create_ssl_context(trust_env=environment)
     try:
         return ssl.create_default_context(cafile=settings.ca_file)
-    except ssl.SSLError as error:
-        raise MachineFileError(
-            f"webhooks.{settings.name}: ca_file {settings.ca_file} holds no certificate (PEM)"
-        ) from error
     except OSError as error:
-        raise MachineFileError(
-            f"webhooks.{settings.name}: ca_file {settings.ca_file} cannot be read: {error.strerror or error}"
-        ) from error
+        damaged = isinstance(error, ssl.SSLError)
+        why = "holds no certificate (PEM)" if damaged else f"cannot be read: {error.strerror or error}"
+        raise MachineFileError(f"webhooks.{settings.name}: ca_file {settings.ca_file} {why}") from error
