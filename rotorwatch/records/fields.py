@@ -26,16 +26,12 @@ def finite(value: float | None) -> float | None:
 
 
 Number = Annotated[float | None, AfterValidator(finite)]  # infinity and NaN become null
-
 Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
-
 Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
-
 BundleIdentity = Annotated[
     str | None,
     Field(description="identity of the trained or commissioned bundle; null without", examples=["lab-3f9c1e0b7a52"]),
 ]
-
 MachineHash = Annotated[
     str,
     Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
@@ -50,7 +46,5 @@ class OfMachine(Record):
 
 
 ParameterName = Annotated[str, Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])]
-
 ParameterText = Annotated[str, Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])]
-
 Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]

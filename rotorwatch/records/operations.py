@@ -21,9 +21,7 @@ _Reason = Annotated[
         examples=["sensor cable is being replaced"],
     ),
 ]
-
 _GivenReason = Annotated[_Reason, Field(pattern=NOT_BLANK)]
-
 _ExpectedState = Annotated[
     AlarmState | None,
     Field(description="state in which you saw the alarm; needed without If-Match", examples=["unacknowledged"]),

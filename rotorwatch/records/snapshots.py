@@ -13,9 +13,7 @@ from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, O
 Units = Literal["channel", "SI"]
 
 _Series = tuple[float | None, ...]
-
 _Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
-
 _DensityUnit = Annotated[
     str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
 ]
