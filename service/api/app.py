@@ -39,19 +39,16 @@ _DESCRIPTION = """Health of rotating machines: which parameter changed, by how m
 Every route listed here except `/healthz` needs a token with its scope. Errors are problem details (RFC 9457).
 Times in ns count from 1970-01-01 UTC.
 """
-_TAGS = [
-    {"name": "machines", "description": "Monitored machines and their state."},
-    {"name": "alarms", "description": "Alarms, and operators' actions on them."},
-    {"name": "history", "description": "Past alarms, reports and readings."},
-    {
-        "name": "snapshots",
-        "description": "Correlations, spectra, orbits and plots, of the newest data or of recordings.",
-    },
-    {"name": "events", "description": "Alarm events and changes of health as they happen."},
-    {"name": "recordings", "description": "Recorded streams."},
-    {"name": "replays", "description": "Recordings evaluated again or published again, apart from live data."},
-    {"name": "service", "description": "The monitor itself."},
-]
+_TAGS = {
+    "machines": "Monitored machines and their state.",
+    "alarms": "Alarms, and operators' actions on them.",
+    "history": "Past alarms, reports and readings.",
+    "snapshots": "Correlations, spectra, orbits and plots, of the newest data or of recordings.",
+    "events": "Alarm events and changes of health as they happen.",
+    "recordings": "Recorded streams.",
+    "replays": "Recordings evaluated again or published again, apart from live data.",
+    "service": "The monitor itself.",
+}
 _SMALLEST_CHANGE = 1e-6
 _METRICS = (
     "# HELP rotorwatch_blocks_accepted_total Blocks accepted\n"
@@ -123,7 +120,13 @@ class DescribedApp(FastAPI):
 
 
 def only_known_arguments(request: Request) -> None:
-    """Refuse a query argument that the route does not have: a misspelt one would otherwise be silently ignored."""
+    """Refuse a query argument that the route does not have: a misspelt one would otherwise be silently ignored.
+
+    Raises
+    ------
+    RequestValidationError
+        Naming the argument and those of the route.
+    """
     given = request.query_params.keys()
     if not given or not request.scope["path"].startswith("/api/") or not isinstance(request.app, DescribedApp):
         return
@@ -144,7 +147,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         title="rotorwatch",
         version=__version__,
         description=_DESCRIPTION,
-        openapi_tags=_TAGS,
+        openapi_tags=[{"name": name, "description": text} for name, text in _TAGS.items()],
         dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
         docs_url=None,  # the default pages load scripts from the internet; those of `add_docs_routes` do not

@@ -135,6 +135,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             raise HTTPException(
                 428, "state how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
             )
+        version = re.search(r"-?[0-9]+", if_match or "")  # a compressing proxy may have made a weak ETag of it
         operation = OperatorAction(
             kind=kind,
             alarm=name,
@@ -143,7 +144,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             duration_s=order.duration_s if isinstance(order, ShelveOrder) else None,
             one_shot=order.one_shot if isinstance(order, ShelveOrder) else False,
             expected_state=None if order.expected_state is None else order.expected_state.value,
-            expected_version=_version(if_match),
+            expected_version=None if version is None else int(version[0]),
         )
         try:
             events = view.operate(operation)
@@ -165,9 +166,3 @@ def _present(view: Monitored, name: str) -> Alarm:
 def _marked(alarm: Alarm, response: Response) -> Alarm:
     response.headers["ETag"] = f'"{alarm.version}"'
     return alarm
-
-
-def _version(if_match: str | None) -> int | None:
-    """Version in an ETag, which a compressing proxy may have turned into a weak one."""
-    found = re.search(r"-?[0-9]+", if_match or "")
-    return None if found is None else int(found[0])

@@ -27,16 +27,10 @@ from service.access.guard import Guard
 from service.access.problems import problem_answer, responses, written
 from service.analysis.past import Past
 from service.analysis.recorded import Sampled
+from service.analysis.snapshots import plots
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
-from service.analysis.snapshots.plots import (
-    centreline_series,
-    full_spectrum_snapshot,
-    vector_series,
-    waterfall_snapshot,
-    waveform_snapshot,
-)
 from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, InPath, SinceNs, UntilNs
 from service.stream.monitored import Monitored
@@ -104,19 +98,17 @@ class WindowAnswers:
                 del self._kept[next(iter(self._kept))]
         with kept.lock:
             now_s, mark = self._clock(), data.mark()
-            holds = kept.mark == mark and not (of_samples and self._is_late(kept, data, now_s))
-            if kept.body is None or not holds:
+            late = of_samples and (
+                now_s - kept.made_s > _SAMPLES_HOLD_S
+                or kept.newest_ns is None
+                or not data.blocks
+                or data.blocks[0].start_ns > kept.newest_ns
+            )
+            if kept.body is None or kept.mark != mark or late:
                 kept.body = make().model_dump_json().encode()
                 kept.mark, kept.made_s = mark, now_s
                 kept.newest_ns = data.blocks[-1].start_ns if data.blocks else None
             return Response(kept.body, media_type="application/json")
-
-    @staticmethod
-    def _is_late(kept: _Kept, data: LatestData, now_s: float) -> bool:
-        oldest_ns = data.blocks[0].start_ns if data.blocks else None
-        if now_s - kept.made_s > _SAMPLES_HOLD_S or kept.newest_ns is None or oldest_ns is None:
-            return True
-        return oldest_ns > kept.newest_ns
 
 
 def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
@@ -213,14 +205,14 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         speed = None if window is None or chosen.recorded else window.speed_rad_s
 
         def made(found: Sampled) -> WaveformSnapshot:
-            return waveform_snapshot(found, found.channels(names), revolutions, speed)
+            return plots.waveform_snapshot(found, found.channels(names), revolutions, speed)
 
         return _made(reader, view, chosen, WaveformSnapshot, made, _SOON_S)
 
     @app.get(f"{PLACE}/full-spectra", responses=responses(FullSpectrumSnapshot, 404, 422), **common)
     def full_spectra(view: InPath, chosen: ChosenWindow) -> FullSpectrumSnapshot:
         """Full spectra of the newest seconds: forward and reverse precession at each place with two displacements."""
-        return _made(reader, view, chosen, FullSpectrumSnapshot, full_spectrum_snapshot, _SOON_S)
+        return _made(reader, view, chosen, FullSpectrumSnapshot, plots.full_spectrum_snapshot, _SOON_S)
 
     @app.get(f"{PLACE}/waterfalls", responses=responses(WaterfallSnapshot, 404, 422), **common)
     def waterfalls(
@@ -237,7 +229,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         def made(found: Sampled) -> WaterfallSnapshot:
             if not shown:
                 raise RotorwatchError("no channel measures a vibration")
-            return waterfall_snapshot(found, found.channels([shown[0].name])[0], over)
+            return plots.waterfall_snapshot(found, found.channels([shown[0].name])[0], over)
 
         return _made(reader, view, chosen, WaterfallSnapshot, made, over=over)
 
@@ -258,7 +250,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         def made(found: Sampled | Past) -> VectorSeries:
             if not found.has_angle:
                 raise RotorwatchError(_NO_ANGLE)
-            return vector_series(found, found.channels(names), order, revolutions, slow_roll_rpm)
+            return plots.vector_series(found, found.channels(names), order, revolutions, slow_roll_rpm)
 
         if slow_roll_rpm is not None and not recording:
             raise HTTPException(422, "slow_roll_rpm: needs samples, so name a recording")
@@ -271,4 +263,4 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
     ) -> CentrelineSeries:
         """Average position of the shaft over time and speed, from the history or recordings."""
         chosen = Chosen(tuple(recording), None, since_ns, until_ns)
-        return _made(reader, view, chosen, CentrelineSeries, centreline_series, of_history=True)
+        return _made(reader, view, chosen, CentrelineSeries, plots.centreline_series, of_history=True)
