@@ -296,7 +296,15 @@ class Metrics:
         readiness = self._service.readiness()
         observed = [Observed(one, one.health(), one.status(), self._counted(one)) for one in self._service.machines()]
         yield from machine_families(observed)
-        yield from _service_families(readiness)
+        build = InfoMetricFamily("rotorwatch_build", "Version of the monitor")
+        build.add_metric((), {"version": __version__, "python": platform.python_version()})
+        yield build
+        for name, text, value in (
+            ("ready", "1 if /readyz says so", readiness.ready),
+            ("session_open", "1 if the Zenoh session is open", readiness.session_open),
+            ("history_failing", "1 if the history cannot be written", bool(readiness.history_trouble)),
+        ):
+            yield GaugeMetricFamily(f"rotorwatch_{name}", text, value=value)
         webhooks = [((one.name,), one) for one in self._service.webhooks.statuses().webhooks]
         yield from (family.metric(("webhook",), webhooks) for family in _WEBHOOK_FAMILIES)
         yield from self._http_families()
@@ -327,14 +335,3 @@ class Metrics:
         for reason, count in self._requests.refused().items():
             refused.add_metric((reason,), count)
         yield refused
-
-
-def _service_families(readiness: Readiness) -> Iterator[Metric]:
-    build = InfoMetricFamily("rotorwatch_build", "Version of the monitor")
-    build.add_metric((), {"version": __version__, "python": platform.python_version()})
-    yield build
-    yield GaugeMetricFamily("rotorwatch_ready", "1 if /readyz says so", value=readiness.ready)
-    yield GaugeMetricFamily("rotorwatch_session_open", "1 if the Zenoh session is open", value=readiness.session_open)
-    yield GaugeMetricFamily(
-        "rotorwatch_history_failing", "1 if the history cannot be written", value=bool(readiness.history_trouble)
-    )

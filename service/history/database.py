@@ -58,7 +58,13 @@ class _Use:
 
 
 class Database:
-    """Connections to one database, with URL and time limit of a `service.history.store.Store`; for any thread."""
+    """Connections to one database, with URL and time limit of a `service.history.store.Store`; for any thread.
+
+    Raises
+    ------
+    StoreError
+        If the address is of no known form.
+    """
 
     def __init__(self, url: str, timeout_s: float) -> None:
         self.timeout_s = timeout_s
@@ -126,7 +132,13 @@ class Database:
         return self._engine
 
     def rows(self, query: Select[*tuple[Any, ...]]) -> Sequence[Row[*tuple[Any, ...]]]:
-        """Everything that a query finds; StoreError if the history is closed, or the database fails or is silent."""
+        """Everything that a query finds.
+
+        Raises
+        ------
+        StoreError
+            If the history is closed, or the database fails or does not answer.
+        """
         with self.reading() as connection:
             return connection.execute(query).all()
 

@@ -40,7 +40,13 @@ class Reduction:
         self._thread.join(self._database.answer_s)
 
     def run(self, now_ns: int) -> Dropped:
-        """Drop what is too old at a time of the computer, readings once they are in buckets; runs every few minutes."""
+        """Drop what is too old at a time of the computer, readings once they are in buckets; runs every few minutes.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
         kept = self._retention
         with self._turn:
             return Dropped(

@@ -17,7 +17,13 @@ _TIMEOUT_S = 5.0
 
 
 def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
-    """The latest events committed to a machine's log since a time of recording, at most 10 000, in order."""
+    """The latest events committed to a machine's log since a time of recording, at most 10 000, in order.
+
+    Raises
+    ------
+    StoreError
+        If the database fails.
+    """
     log = alarm_events.c
     query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
     query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
@@ -28,7 +34,10 @@ def alarms_since(database: Database, site: str, name: str, recorded_ns: int) -> 
 def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
     """`alarms_since` of a history that another program writes: it is opened read-only and closed again.
 
-    Raises StoreError if there is no such history, or it cannot be read.
+    Raises
+    ------
+    StoreError
+        If there is no such history, or it cannot be read.
     """
     database = Database(url, _TIMEOUT_S)
     database.start(read_only=True)
@@ -77,7 +86,8 @@ class AuditLog:
         storable = {name: _storable(text) for name, text in texts.items()}
         entry = insert(audit_log).values(at_ns=at_ns, status=status, **storable)
         with self._database.writing() as connection:
-            return connection.execute(entry.returning(audit_log.c.number)).scalar_one()
+            number: int = connection.execute(entry.returning(audit_log.c.number)).scalar_one()
+        return number
 
     def entries(
         self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
@@ -111,7 +121,13 @@ class TokenStore:
         self._database = database
 
     def add(self, record: TokenRecord) -> None:
-        """Keep a new token; StoreError if a scope holds a blank, or there is a token with this identifier."""
+        """Keep a new token.
+
+        Raises
+        ------
+        StoreError
+            If a scope holds a blank, or there is a token with this identifier.
+        """
         if any(not scope or scope.split() != [scope] for scope in record.scopes):
             raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
         values = asdict(record) | {"scopes": " ".join(record.scopes)}

@@ -62,7 +62,10 @@ class Writer:
     def stop(self) -> None:
         """Write what waits, if the database takes it, and release all machines.
 
-        Raises StoreError if the database does not take it, saying what is lost.
+        Raises
+        ------
+        StoreError
+            If the database does not take it, saying what is lost.
         """
         with self._lock:
             self._stopping.set()  # steps submitted before this are still written
@@ -76,7 +79,13 @@ class Writer:
             raise StoreError(f"could not be written before the end, and is lost: {'; '.join(lost)}")
 
     def claim(self, site: str, name: str) -> Claim:
-        """Register a machine and take the right to write it; StoreError if another monitor, or this one, writes it."""
+        """Register a machine and take the right to write it.
+
+        Raises
+        ------
+        StoreError
+            If another monitor, or this one already, writes it.
+        """
         claim = Claim(site, name, self._most_reports)
         with self._database.plainly(), self._connected() as connection:
             if any(other.title == claim.title for other in self._claims):
@@ -86,7 +95,13 @@ class Writer:
         return claim
 
     def submit(self, claim: Claim, step: Step, packed: Iterable[PackedReport], recorded_ns: int) -> bool:
-        """Put a step behind those that wait and say whether it has become durable; StoreError if it is refused."""
+        """Put a step behind those that wait and say whether it has become durable.
+
+        Raises
+        ------
+        StoreError
+            If it is refused for good.
+        """
         with self._lock:
             if claim.lost is not None:
                 raise claim.lost

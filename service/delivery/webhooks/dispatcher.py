@@ -205,7 +205,10 @@ class Dispatcher:
             return False
         if settings.severities and event.severity not in settings.severities:
             return False
-        return not settings.annunciated_only or _annunciated(event)
+        try:
+            return not settings.annunciated_only or AlarmCloudEvent.model_validate_json(event.text).data.annunciated
+        except ValidationError:  # written by another version of the program: rather one too many than one too few
+            return True
 
     def _attempt(self, lane: _Lane, event: StoredEvent) -> None:
         answer = self._receiver.post(event.id, event.text.encode())
@@ -259,13 +262,6 @@ class Dispatcher:
 
     def _note(self, error: str) -> None:
         self._last_error, self._last_error_ns = error, self._now_ns()
-
-
-def _annunciated(event: StoredEvent) -> bool:
-    try:
-        return AlarmCloudEvent.model_validate_json(event.text).data.annunciated
-    except ValidationError:  # written by another version of the program: rather one too many than one too few
-        return True
 
 
 class Webhooks:
