@@ -160,12 +160,12 @@ class Writer:
         with self._lock:
             for claim in ready:
                 bundle, claim.attempt, claim.trouble = claim.attempt, StepBundle(), ""
-                error = refused.get(claim)
-                if error is None:
+                refusal = refused.get(claim)
+                if refusal is None:
                     claim.written += 1
                 elif not bundle.heard:
-                    _log.error("a step was refused", why=str(error))
-                bundle.settle(error, written=True)
+                    _log.error("a step was refused", why=str(refusal))
+                bundle.settle(refusal, written=True)
             self._recover()
         return True
 

@@ -84,7 +84,10 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         """Alarm events from the history, each once and in the order of its machine's log, and changes of health."""
         if service.feed.closed:
             raise HTTPException(503, "the service is being stopped")
-        logs = _logs(service, machine)
+        there = {one.machine.title: one.history for one in service.machines()}
+        if unknown := [place for place in machine if place not in there]:
+            raise HTTPException(404, f"no machine {unknown[0][:129]}; there are: {', '.join(there)}")
+        logs = {place: log for place, log in there.items() if place in machine or not machine}
         cursor = _cursor(logs, (header or "", last_event_id or ""), from_)
 
         async def admitted() -> bool:
@@ -101,14 +104,6 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
             media_type="text/event-stream",
             headers={"X-Accel-Buffering": "no"},
         )
-
-
-def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, MachineStore]:
-    there = {one.machine.title: one.history for one in service.machines()}
-    unknown = next((place for place in wanted if place not in there), None)
-    if unknown is not None:
-        raise HTTPException(404, f"no machine {unknown[:129]}; there are: {', '.join(there)}")
-    return {place: log for place, log in there.items() if place in wanted or not wanted}
 
 
 def _cursor(logs: Mapping[str, MachineStore], texts: tuple[str, ...], begin: str) -> Cursor:

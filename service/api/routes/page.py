@@ -35,9 +35,8 @@ _DOCS = (
     f'<script src="/docs/swagger-ui-bundle.js"></script><script>{_SCRIPT}</script></html>'
 )
 _HASH = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
-_DOCS_POLICY = (
-    f"default-src 'none'; script-src 'self' 'sha256-{_HASH}'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+_DOCS_POLICY = _POLICY.replace(
+    "script-src 'self'; style-src 'self'", f"script-src 'self' 'sha256-{_HASH}'; style-src 'self' 'unsafe-inline'"
 )
 
 
