@@ -89,12 +89,8 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     """Import the client on first access, so that users of the records alone do not import an HTTP client."""
-    if name == "Client":
-        from rotorwatch.client.client import Client  # noqa: PLC0415
+    if name in {"Client", "ServiceEvent"}:
+        from rotorwatch.client import client  # noqa: PLC0415
 
-        return Client
-    if name == "ServiceEvent":
-        from rotorwatch.client.event_stream import ServiceEvent  # noqa: PLC0415
-
-        return ServiceEvent
+        return getattr(client, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -33,13 +33,7 @@ def refusal(answer: httpx.Response) -> RequestRefused:
 
 
 def understood(model: type[M], text: str | bytes, place: str) -> M:
-    """Parse JSON as a model.
-
-    Raises
-    ------
-    ClientError
-        If it does not match, for example because service and client have different versions.
-    """
+    """Parse JSON as a model; ClientError if it does not match, as when service and client have different versions."""
     try:
         return model.model_validate_json(text)
     except ValidationError as error:

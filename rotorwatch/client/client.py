@@ -3,15 +3,14 @@
 import os
 import re
 import ssl
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Self
 
 import httpx
-from pydantic import BaseModel
 
-from rotorwatch.client.answers import refusal, understood
+from rotorwatch.client.answers import M, refusal, understood
 from rotorwatch.client.errors import ClientError, NoAnswer
 from rotorwatch.client.event_stream import ServiceEvent, service_events
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState, AlarmStates, EventKind, Severity
@@ -36,7 +35,6 @@ _MACHINES = "/api/v1/machines"
 _PLACE = re.compile(r"[A-Za-z0-9_-]+/[A-Za-z0-9_-]+")
 _BELOW = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.:-]*(/[A-Za-z0-9_-][A-Za-z0-9_.:-]*)*")
 
-M = TypeVar("M", bound=BaseModel)
 _Parameter = str | int | float | bool | None | Sequence[str]
 
 
@@ -105,7 +103,7 @@ class Client:
 
     def machines(self) -> tuple[MachineDescription, ...]:
         """Every monitored machine with its state."""
-        return understood(MachineList, self._ask("GET", _MACHINES).content, _MACHINES).machines
+        return self._read(MachineList, _MACHINES, {}).machines
 
     def machine(self, place: str) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
@@ -317,15 +315,14 @@ class Client:
         return service_events(self._http, parameters, after)
 
     def _get(self, model: type[M], place: str, below: str = "", **parameters: _Parameter) -> M:
-        path = _path(place, below)
-        return understood(model, self._ask("GET", path, **parameters).content, path)
+        return self._read(model, _path(place, below), parameters)
 
     def _pages(
         self, model: type[M], path: str, cursor: str, begin: int | None, **parameters: _Parameter
     ) -> Iterator[M]:
         """Fetch pages until one has no cursor of a next page."""
         while True:
-            page = understood(model, self._ask("GET", path, **{cursor: begin}, **parameters).content, path)
+            page = self._read(model, path, {cursor: begin} | parameters)
             yield page
             begin = getattr(page, f"next_{cursor}")
             if begin is None:
@@ -336,11 +333,11 @@ class Client:
         answer = self._send("POST", path, {}, order, {"If-Match": f'"{seen.version}"'})
         return understood(OperationDone, answer.content, path)
 
-    def _ask(self, method: str, path: str, **parameters: _Parameter) -> httpx.Response:
-        return self._send(method, path, parameters, None, {})
+    def _read(self, model: type[M], path: str, parameters: Mapping[str, _Parameter]) -> M:
+        return understood(model, self._send("GET", path, parameters, None, {}).content, path)
 
     def _send(
-        self, method: str, path: str, parameters: dict[str, _Parameter], body: object, headers: dict[str, str]
+        self, method: str, path: str, parameters: Mapping[str, _Parameter], body: object, headers: dict[str, str]
     ) -> httpx.Response:
         given = {
             name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
@@ -364,13 +361,7 @@ class Client:
 
 
 def _checked(url: str) -> httpx.URL:
-    """Parse the address of a service.
-
-    Raises
-    ------
-    ClientError
-        If it is not a valid HTTP address.
-    """
+    """Parse the address of a service; ClientError if it is not a valid HTTP address."""
     with suppress(httpx.InvalidURL):
         found = httpx.URL(url)
         if found.scheme in {"http", "https"} and found.host and (found.port or 0) < 65_536:
@@ -380,13 +371,7 @@ def _checked(url: str) -> httpx.URL:
 
 
 def _path(place: str, below: str) -> str:
-    """URL path of a machine, or of a resource below it.
-
-    Raises
-    ------
-    ClientError
-        If a name in it is invalid and might lead to another path.
-    """
+    """URL path of a machine, or of a resource below it; ClientError for a name that might lead to another path."""
     if not _PLACE.fullmatch(place):
         raise ClientError(f"{place!r}: expected a machine as site/machine, such as demo/lab")
     if below and not _BELOW.fullmatch(below):

@@ -64,17 +64,13 @@ _AlarmName = Annotated[
         examples=["k_by"],
     ),
 ]
-
 _AlarmChange = Annotated[
     Number, Field(description="deciding relative change; null if not about a parameter", examples=[-0.247])
 ]
-
 _AlarmError = Annotated[Number, Field(description="standard error of the relative change", examples=[0.0071])]
-
 _AlarmInterval = Annotated[
     tuple[float, float] | None, Field(description="95 % interval of the relative change", examples=[(-0.261, -0.233)])
 ]
-
 _LowConfidence = Annotated[
     bool,
     Field(
@@ -82,7 +78,6 @@ _LowConfidence = Annotated[
         examples=[False],
     ),
 ]
-
 _Note = Annotated[
     str,
     Field(

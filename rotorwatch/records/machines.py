@@ -2,6 +2,7 @@
 
 from pydantic import Field, JsonValue
 
+from rotorwatch.records.example import example
 from rotorwatch.records.fields import (
     EXAMPLE_NS,
     BundleIdentity,
@@ -43,21 +44,7 @@ class MachineDescription(OfMachine):
         description="nominal speed, null where the machine file gives none", examples=[1320.0]
     )
     rate_hz: float = Field(description="samples per second and channel", examples=[2000.0])
-    channels: tuple[Channel, ...] = Field(
-        description="columns of the stream",
-        examples=[
-            (
-                {
-                    "name": "y1",
-                    "quantity": "displacement",
-                    "location": "bearing",
-                    "direction": "y",
-                    "unit": "um",
-                    "angle_deg": None,
-                },
-            )
-        ],
-    )
+    channels: tuple[Channel, ...] = Field(description="columns of the stream", examples=[(example(Channel),)])
     window_length_s: float = Field(description="length of the sliding window", examples=[60.0])
     window_hop_s: float = Field(description="data time between reports", examples=[5.0])
     keys: dict[str, str] = Field(

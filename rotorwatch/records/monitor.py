@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from rotorwatch.records.fields import EXAMPLE_NS, REQUEST, OfMachine, Record
+from rotorwatch.records.fields import EXAMPLE_NS, OfMachine, Record, Request
 from rotorwatch.records.health import State
 
 
@@ -95,10 +95,8 @@ class TokenList(Record):
     tokens: tuple[TokenEntry, ...] = Field(description="oldest first")
 
 
-class TokenRequest(BaseModel):
+class TokenRequest(Request):
     """A token to be created."""
-
-    model_config = REQUEST
 
     name: str = Field(
         min_length=1,

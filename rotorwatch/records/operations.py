@@ -2,14 +2,12 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState
-from rotorwatch.records.fields import REQUEST, Record
+from rotorwatch.records.fields import Record, Request
 
 OperationKind = Literal["acknowledge", "reset", "shelve", "unshelve", "remove-from-service", "return-to-service"]
-
-_LONGEST_REASON = 500
 
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 NOT_BLANK = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
@@ -17,43 +15,35 @@ NOT_BLANK = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 _Reason = Annotated[
     str,
     Field(
-        max_length=_LONGEST_REASON,
+        max_length=500,
         pattern=PRINTABLE,
         description="reason for the operation; it is written into the alarm log and the audit log",
         examples=["sensor cable is being replaced"],
     ),
 ]
-
 _GivenReason = Annotated[_Reason, Field(pattern=NOT_BLANK)]
-
 _ExpectedState = Annotated[
     AlarmState | None,
     Field(description="state in which you saw the alarm; needed without If-Match", examples=["unacknowledged"]),
 ]
 
 
-class OperationOrder(BaseModel):
+class OperationOrder(Request):
     """Request to acknowledge, unshelve or reset an alarm, or to return it to service."""
-
-    model_config = REQUEST
 
     reason: _Reason = ""
     expected_state: _ExpectedState = None
 
 
-class ReasonedOrder(BaseModel):
+class ReasonedOrder(Request):
     """Request to take an alarm out of service."""
-
-    model_config = REQUEST
 
     reason: _GivenReason
     expected_state: _ExpectedState = None
 
 
-class ShelveOrder(BaseModel):
+class ShelveOrder(Request):
     """Request to shelve an alarm."""
-
-    model_config = REQUEST
 
     reason: _GivenReason
     duration_s: float | None = Field(

@@ -12,24 +12,19 @@ from pydantic import Field
 from rotorwatch.records.fields import EXAMPLE_NS, OfMachine, Record
 
 _Series = tuple[float | None, ...]
-
 _Reason = Annotated[str, Field(description="why values are missing; empty if all are there", examples=[""])]
-
 _Speed = Annotated[
     float | None,
     Field(description="mean speed, negative where the shaft turns from z to y; null if not known", examples=[138.23]),
 ]
-
 _Speeds = Annotated[
     _Series,
     Field(description="speed of each value, negative for rotation from z to y", examples=[(62.8, 94.2, 138.23)]),
 ]
-
 _Times = Annotated[
     tuple[int, ...],
     Field(description="time of each", examples=[(EXAMPLE_NS - 2_000_000_000, EXAMPLE_NS - 1_000_000_000, EXAMPLE_NS)]),
 ]
-
 _Location = Annotated[str, Field(description="place at which two displacements are measured", examples=["bearing"])]
 
 

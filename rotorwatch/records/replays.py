@@ -2,10 +2,10 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import REQUEST, Record
+from rotorwatch.records.fields import Record, Request
 from rotorwatch.records.health import Report
 
 TOML_NAME = r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,94}\.toml$"
@@ -74,10 +74,8 @@ class ReplayLine(Record):
     summary: OfflineSummary | None = None
 
 
-class ReplayRequest(BaseModel):
+class ReplayRequest(Request):
     """A replay to be started."""
-
-    model_config = REQUEST
 
     recordings: tuple[str, ...] = Field(
         min_length=1,
@@ -170,16 +168,15 @@ class ReplayJob(Record):
     error: str = Field(description="why it failed; empty otherwise", examples=[""])
 
 
-class ReplaySeek(BaseModel):
+class ReplaySeek(Request):
     """Position from which a replay continues: a time, or an offset from the current position."""
 
     model_config = ConfigDict(
-        **REQUEST,
         json_schema_extra={
             "if": {"properties": {"to_ns": {"type": "integer"}}, "required": ["to_ns"]},
             "then": {"properties": {"by_s": {"type": "null"}}},
             "else": {"properties": {"by_s": {"type": "number"}}, "required": ["by_s"]},
-        },
+        }
     )
 
     to_ns: int | None = Field(default=None, ge=0, description="time of the data", examples=[1767225700000000000])

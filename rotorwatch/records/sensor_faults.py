@@ -33,9 +33,6 @@ class FaultKind(StrEnum):
     GAIN = "gain", "gain", "relative"
     DELAY = "delay", "delay", "s"
     SWAPPED = "swapped", "channels swapped", "share of motion that the sensors have in common"
-    INCOHERENT = (
-        "incoherent",
-        "sensors contradict each other",  # if no other kind explains it
-        "share of motion that the sensors have in common",
-    )
+    # If no other kind explains it.
+    INCOHERENT = "incoherent", "sensors contradict each other", "share of motion that the sensors have in common"
     NOISE = "noise", "noise level", "its rms over that of the channel (rad for the shaft angle)"

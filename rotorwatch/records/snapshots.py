@@ -13,13 +13,7 @@ from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, O
 Units = Literal["channel", "SI"]
 
 _Series = tuple[float | None, ...]
-
 _Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
-
-_SumUnit = Annotated[
-    str, Field(description="unit of the values: a product of the two channels' units", examples=["um^2"])
-]
-
 _DensityUnit = Annotated[
     str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
 ]
@@ -66,7 +60,7 @@ class CorrelationPair(Record):
 
     first: str = Field(description="name of channel i, the reference", examples=["y1"])
     second: str = Field(description="name of channel j, the response", examples=["y2"])
-    unit: _SumUnit
+    unit: str = Field(description="unit of the values: a product of the two channels' units", examples=["um^2"])
     measured: _Series = Field(description="estimated in the window", examples=[(94.31, 93.67, 91.77)])
     standard_error: _Series = Field(description="standard error of `measured`", examples=[(3.37, 3.31, 3.19)])
     nominal: _Series | None = Field(

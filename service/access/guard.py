@@ -21,28 +21,35 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, Request
+from fastapi import Depends, FastAPI, Request, Security
+from fastapi.dependencies.models import Dependant
+from fastapi.openapi.models import HTTPBase, HTTPBearer
 from fastapi.responses import JSONResponse, Response
+from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
+from fastapi.security.base import SecurityBase
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from models.errors import RotorwatchError
-from service.access.audit import AuditTrail, Visit
-from service.access.credentials import address_of, kept_text, key_of, network_of, presented_text, unauthenticated
-from service.access.middleware import VISIT, AccessMiddleware
-from service.access.origin import SAFE_METHODS, check_body_type, check_origin
-from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
-from service.access.requirement import (
-    PAGE_FILES,
-    PROBE_PATHS,
-    PUBLIC_PATHS,
-    Requirement,
-    declared_scopes,
-    requires,
-    unguarded_routes,
+from service.access.audit import AuditNote, AuditTrail, Visit
+from service.access.credentials import (
+    BEARER,
+    NEEDED,
+    SAFE_METHODS,
+    address_of,
+    check_body_type,
+    check_origin,
+    kept_text,
+    key_of,
+    network_of,
+    presented_text,
+    unauthenticated,
 )
+from service.access.middleware import CALLER, VISIT, AccessMiddleware
+from service.access.rates import MovingWindow, StreamSeats
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, parse_token, token_is_valid, token_state
 from service.history.records import TokenRecord
@@ -50,14 +57,78 @@ from service.history.shared import AuditLog, TokenStore
 from service.settings.access import AccessSettings
 from service.terminal.logs import Limiter, logger
 
+PUBLIC_PATHS = frozenset(("/", "/healthz"))
+"""Paths that anybody may GET: the page knows nothing until somebody has signed in there."""
+
+PAGE_FILES = "/page/"
+"""Beginning of further paths that anybody may GET."""
+
+PROBE_PATHS = frozenset(("/healthz", "/readyz"))
+"""Paths by which others decide whether to restart the service; however many ask, they are answered."""
+
 _log = logger(part="access")
 _KNOWN_TOKENS = 1_000
 _WITHOUT_DATABASE_S = 900.0
-_SEATS_RETRY_S = 5
 
 
 class AccessError(RotorwatchError):
     """An application cannot be guarded the way it is built."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Gives the caller of a route, if that has a scope."""
+
+    scope: Scope
+
+    def __call__(self, request: Request) -> Caller:
+        """Return the caller; HTTPException 401 without one, 403 if the scope is missing."""
+        caller = getattr(request.state, CALLER, None)
+        if not isinstance(caller, Caller):  # the request did not pass the middleware
+            raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
+        if self.scope not in caller.scopes:
+            granted = ", ".join(scope for scope in Scope if scope in caller.scopes)
+            text = f"this needs the scope {self.scope}; {caller.name} has {granted or 'none'}"
+            request.state.audit = AuditNote(reason=text)
+            raise HTTPException(403, text)
+        return caller
+
+
+class _Shown(SecurityBase):
+    """A way to present a token as OpenAPI shows it; the middleware checks the token."""
+
+    def __init__(self, model: HTTPBase, scheme_name: str) -> None:
+        self.model = model
+        self.scheme_name = scheme_name
+
+    async def __call__(self) -> None:
+        """Nothing is left to do."""
+
+
+_BEARER = _Shown(HTTPBearer(bearerFormat="rw_<id>_<secret>", description="token of rotorwatch token create"), "token")
+_BASIC = _Shown(
+    HTTPBase(scheme="basic", description="for browsers, GET only: any user name, and the token as password"), "browser"
+)
+
+
+def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
+    """Dependency that gives a `Caller` with a scope; with `in_browsers`, OpenAPI offers the token as password too."""
+    requirement = Requirement(scope)
+
+    def with_token(
+        caller: Annotated[Caller, Depends(requirement)],
+        _token: Annotated[None, Security(_BEARER, scopes=[scope.value])],
+    ) -> Caller:
+        return caller
+
+    def with_token_or_password(
+        caller: Annotated[Caller, Depends(requirement)],
+        _token: Annotated[None, Security(_BEARER, scopes=[scope.value])],
+        _password: Annotated[None, Security(_BASIC, scopes=[scope.value])],
+    ) -> Caller:
+        return caller
+
+    return Depends(with_token_or_password if in_browsers else with_token)
 
 
 class Guard:
@@ -98,7 +169,6 @@ class Guard:
         self.read: Any = requires(Scope.READ, in_browsers=True)
         self.operate: Any = requires(Scope.OPERATE)
         self.configure: Any = requires(Scope.CONFIGURE)
-        self.stream: Any = Depends(self._stream_dependency())
         self.gate: Any = Depends(self.pass_gate)
         self.tokens = tokens
         self.last_used_ns: dict[str, int] = {}
@@ -109,6 +179,12 @@ class Guard:
         self._monotonic = monotonic
         self._limiter = Limiter(monotonic)
         self._known: OrderedDict[bytes, tuple[TokenRecord, float]] = OrderedDict()  # valid ones, and when looked up
+
+        async def stream(caller: Annotated[Caller, self.read]) -> AsyncIterator[Caller]:
+            with self.seats.seat(key_of(caller)):
+                yield caller
+
+        self.stream: Any = Depends(stream)
 
     def protect(self, app: FastAPI) -> None:
         """Put the middleware around an application that has all its routes, and serve its ``/openapi.json``.
@@ -127,10 +203,9 @@ class Guard:
         def written() -> bytes:
             return bytes(JSONResponse(app.openapi()).body)
 
-        outside = unguarded_routes(app, self.pass_gate)
-        if outside:
+        if outside := self._unguarded_routes(app):
             raise AccessError(
-                f"{', '.join(outside)}: the gate does not stand before this; build the application with "
+                f"{outside}: the gate does not stand before this; build the application with "
                 "FastAPI(dependencies=[guard.gate], openapi_url=None, docs_url=None, redoc_url=None), and add nothing "
                 "but its own routes"
             )
@@ -139,20 +214,13 @@ class Guard:
         )
 
     async def admit(self, request: Request) -> Caller:
-        """Identify the caller, and refuse a request for its token, rate or origin.
-
-        Raises
-        ------
-        HTTPException
-            401, 403, 429 or 503.
-        """
+        """Identify the caller; HTTPException 401, 403, 429 or 503 for the token, rate or origin of a request."""
         address = address_of(request)
-        in_the_open = self.access.open_on_loopback
-        if outside := unguarded_routes(request.app, self.pass_gate):  # one that was added since `protect`
-            raise HTTPException(403, f"{', '.join(outside)}: declares no scope, so nothing is served")
+        if outside := self._unguarded_routes(request.app):  # one that was added since `protect`
+            raise HTTPException(403, f"{outside}: declares no scope, so nothing is served")
         if _is_public(request):
             caller: Caller | None = Caller(NOBODY, address=address)
-        elif in_the_open:
+        elif self.access.open_on_loopback:
             caller = Caller(ANONYMOUS, frozenset(Scope), address)
         else:
             caller = await self._authenticated(request, address)
@@ -162,11 +230,7 @@ class Guard:
             raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
         if caller is None:
             raise HTTPException(401, unauthenticated(request))
-        hosts = self.access.hosts
-        kept = kept_text(request.headers) is not None
-        check_origin(
-            request.headers, request.method, listens_on=self._host, hosts=hosts, open_to_all=in_the_open, kept=kept
-        )
+        check_origin(request, self.access, self._host)
         return caller
 
     def pass_gate(self, request: Request) -> None:
@@ -187,12 +251,22 @@ class Guard:
             Requirement(scope)(request)
         if request.method in SAFE_METHODS:
             return
-        check_body_type(request.headers, request.method)
+        check_body_type(request)
         visit: Visit = getattr(request.state, VISIT)
         try:
             self.trail.start(visit)
         except RotorwatchError as error:
             raise HTTPException(503, f"nothing was done, because the audit log cannot be written: {error}") from error
+
+    def _unguarded_routes(self, app: FastAPI) -> str:
+        """Routes that are not behind the gate: static files, sockets, mounted programs, or routes without it."""
+        outside = sorted(
+            _title(context)
+            for context in iter_route_contexts(app.routes)
+            if not isinstance(context.original_route, APIRoute)
+            or not any(inner.call == self.pass_gate for inner in context.dependant.dependencies)
+        )
+        return ", ".join(outside)
 
     def still_valid(self, caller: Caller) -> bool:
         """Whether a caller's token still holds, for streams that stay open for long; may wait for a database."""
@@ -200,16 +274,6 @@ class Guard:
             return True
         record = self.tokens.find(caller.token_id)
         return record is not None and token_state(record, time.time_ns()) == "valid"
-
-    def _stream_dependency(self) -> Callable[[Caller], AsyncIterator[Caller]]:
-        async def stream(caller: Annotated[Caller, self.read]) -> AsyncIterator[Caller]:
-            try:
-                with self.seats.seat(key_of(caller)):
-                    yield caller
-            except TooManyStreamsError as error:
-                raise HTTPException(429, str(error), {"Retry-After": str(_SEATS_RETRY_S)}) from error
-
-        return stream
 
     async def _authenticated(self, request: Request, address: str) -> Caller | None:
         """Return the owner of the token that is presented; None if none is presented or it is not valid."""
@@ -266,3 +330,25 @@ def _is_public(request: Request) -> bool:
 def _too_many(detail: str, wait_s: float) -> HTTPException:
     seconds = math.ceil(wait_s)
     return HTTPException(429, f"{detail}; try again in {seconds} s", {"Retry-After": str(seconds)})
+
+
+def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozenset[Scope]:
+    """Scopes that a caller of `endpoint` must have; none if one of its routes declares none."""
+    found: set[Scope] = set()
+    for context in iter_route_contexts(app.routes):
+        if context.endpoint is endpoint and endpoint is not None:
+            declared = _required(context.dependant) if isinstance(context.original_route, APIRoute) else None
+            if not declared:
+                return frozenset()
+            found |= declared
+    return frozenset(found)
+
+
+def _required(dependant: Dependant) -> set[Scope]:
+    found = {dependant.call.scope} if isinstance(dependant.call, Requirement) else set()
+    return found.union(*(_required(inner) for inner in dependant.dependencies))
+
+
+def _title(context: RouteContext) -> str:
+    methods = "|".join(sorted(context.methods or ())) or type(context.original_route).__name__
+    return f"{methods} {context.path or '?'}"

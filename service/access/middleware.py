@@ -4,8 +4,9 @@ Written against ASGI itself, so that event streams pass through piece by piece.
 """
 
 from collections.abc import Awaitable, Callable
+from http import HTTPStatus
 
-from fastapi import Request, Response
+from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
@@ -13,17 +14,17 @@ from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from service.access.audit import AuditNote, AuditTrail, Visit
-from service.access.credentials import address_of, challenges, network_of
-from service.access.origin import SAFE_METHODS
+from service.access.credentials import SAFE_METHODS, address_of, challenges, network_of
 from service.access.problems import problem_answer
-from service.access.requirement import CALLER
 from service.access.scopes import Caller
 from service.terminal.logs import Limiter, logger
+
+CALLER = "access_caller"
+"""Attribute of ``request.state`` in which the middleware leaves the caller."""
 
 VISIT = "access_visit"
 """Attribute of ``request.state`` that keeps the request's `Visit`."""
 
-_UNAUTHENTICATED = 401
 _TOO_LARGE = 413
 _LONGEST_NUMBER = 18
 _REFUSED = (401, 403, 429)
@@ -87,7 +88,11 @@ class AccessMiddleware:
 
         async def refuse(refusal: HTTPException) -> None:
             request.state.audit = AuditNote(reason=refusal.detail)
-            await _refusal(request, refusal)(scope, receive, watched)
+            answer = problem_answer(request, refusal.status_code, refusal.detail)
+            answer.headers.update(refusal.headers or {})
+            for challenge in challenges(request) if refusal.status_code == HTTPStatus.UNAUTHORIZED else ():
+                answer.headers.append("WWW-Authenticate", challenge)
+            await answer(scope, receive, watched)
 
         try:
             caller = await self._admitted(request, visit)
@@ -128,12 +133,3 @@ class AccessMiddleware:
         elif visit.method in SAFE_METHODS:
             return
         await run_in_threadpool(self._trail.finish, visit, status, note)
-
-
-def _refusal(request: Request, refusal: HTTPException) -> Response:
-    answer = problem_answer(request, refusal.status_code, refusal.detail)
-    answer.headers.update(refusal.headers or {})
-    if refusal.status_code == _UNAUTHENTICATED:
-        for challenge in challenges(request):
-            answer.headers.append("WWW-Authenticate", challenge)
-    return answer

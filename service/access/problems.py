@@ -4,7 +4,7 @@ from difflib import SequenceMatcher
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import Body, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import iter_route_contexts
@@ -75,6 +75,11 @@ def written(model: type[BaseModel], *problems: int) -> dict[str, Any]:
     return {"responses": responses(model, *problems), "response_model": model}
 
 
+def shown_body(summary: str, value: object) -> Any:
+    """Body of a request, described in OpenAPI by an example."""
+    return Body(openapi_examples={"example": {"summary": summary, "value": value}})
+
+
 def problem_responses(*problems: int, guarded: bool = True) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries of the problems a request may meet, those that any request may meet included."""
     statuses = sorted({*problems, *_ANYWHERE, *(_GUARDED if guarded else ())})
@@ -89,19 +94,15 @@ def share_problems(description: dict[str, Any]) -> None:
     answers = (route["responses"] for routes in description["paths"].values() for route in routes.values())
     for found in answers:
         for status in [int(text) for text in found if int(text) >= HTTPStatus.BAD_REQUEST]:
-            name = _title(status).replace(" ", "")
+            title = _title(status)
+            name = title.replace(" ", "")
             found[str(status)] = {"$ref": f"#/components/responses/{name}"}
-            shared[name] = _response(status)
-
-
-def _response(status: int) -> dict[str, Any]:
-    """Description of a problem, with an example."""
-    shown = {**example(Problem), "title": _title(status), "status": status}
-    if status in _DETAILS:
-        shown["detail"] = _DETAILS[status]
-    content = {_PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}, "example": shown}}
-    headers = {"headers": _HEADERS[status]} if status in _HEADERS else {}
-    return {"description": _title(status), "content": content, **headers}
+            shown = {**example(Problem), "title": title, "status": status}
+            if status in _DETAILS:
+                shown["detail"] = _DETAILS[status]
+            content = {_PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}, "example": shown}}
+            headers = {"headers": _HEADERS[status]} if status in _HEADERS else {}
+            shared[name] = {"description": title, "content": content, **headers}
 
 
 def _title(status: int) -> str:

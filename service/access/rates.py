@@ -9,10 +9,11 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from models.errors import RotorwatchError
+from starlette.exceptions import HTTPException
 
 _MINUTE_S = 60.0
 _KEYS = 10_000
+_SEATS_RETRY = {"Retry-After": "5"}
 
 
 class MovingWindow:
@@ -59,10 +60,6 @@ class MovingWindow:
         return 0.0 if len(hits) < self._amount else hits[0] + _MINUTE_S - now_s
 
 
-class TooManyStreamsError(RotorwatchError):
-    """No seat is left; the message says whether the caller has too many streams or the service."""
-
-
 class StreamSeats:
     """Open event streams: at most `per_caller` of one caller, and `total` in all."""
 
@@ -82,13 +79,16 @@ class StreamSeats:
 
         Raises
         ------
-        TooManyStreamsError
-            If there is none.
+        HTTPException
+            429 if there is none; the message says whether the caller has too many streams or the service.
         """
+        text = ""
         if self._taken[key] >= self._per_caller:
-            raise TooManyStreamsError(f"{self._per_caller} of your event streams are open, the most allowed: close one")
-        if self.taken >= self._total:
-            raise TooManyStreamsError(f"{self._total} event streams are open, the most this service allows")
+            text = f"{self._per_caller} of your event streams are open, the most allowed: close one"
+        elif self.taken >= self._total:
+            text = f"{self._total} event streams are open, the most this service allows"
+        if text:
+            raise HTTPException(429, text, _SEATS_RETRY)
         self._taken[key] += 1
         try:
             yield

@@ -14,13 +14,7 @@ _SOON_S = 30 * 86_400.0
 
 
 def server_arguments(access: AccessSettings) -> dict[str, Any]:
-    """Keyword arguments of ``uvicorn.Config`` that belong to access.
-
-    Raises
-    ------
-    MachineFileError
-        If certificate or key cannot be used.
-    """
+    """Keyword arguments of ``uvicorn.Config`` that belong to access; raises as `tls_context` does."""
     arguments: dict[str, Any] = {
         # Only named proxies: anybody else could write any address into the audit log.
         "proxy_headers": bool(access.proxies),
@@ -42,8 +36,12 @@ def tls_context(tls: HttpTlsSettings) -> ssl.SSLContext:
         Naming the file that is missing, unreadable, damaged, readable by others, or does not fit the other one.
     """
     for name, path in (("certificate", tls.certificate), ("key", tls.key), ("client_ca", tls.client_ca)):
-        if path is not None:
-            _check_readable(name, path)
+        try:
+            if path is not None:
+                with path.open("rb") as file:
+                    file.read(1)
+        except OSError as error:
+            raise MachineFileError(f"{path}: tls.{name} cannot be read: {error.strerror or error}") from error
     if tls.key.stat().st_mode & _READABLE_BY_OTHERS:
         raise MachineFileError(
             f"{tls.key}: tls.key is readable by every user of this computer: chmod 600 {tls.key}, and have "
@@ -81,14 +79,6 @@ def _expiry_warning(certificate: Path) -> str:
         return ""
     left_s, day = end_s - time.time(), time.strftime("%Y-%m-%d", time.gmtime(end_s))
     return "" if left_s > _SOON_S else f"{certificate} {'expired' if left_s < 0 else 'expires'} on {day}"
-
-
-def _check_readable(name: str, path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            file.read(1)
-    except OSError as error:
-        raise MachineFileError(f"{path}: tls.{name} cannot be read: {error.strerror or error}") from error
 
 
 def _pair_text(tls: HttpTlsSettings, error: ssl.SSLError | ValueError) -> str:

@@ -37,23 +37,14 @@ class PresentedToken:
 
 
 def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | None = None) -> tuple[TokenRecord, str]:
-    """Make a token.
+    """Make a token: the record that is stored, and its text, which cannot be retrieved again.
 
     Parameters
     ----------
     name : str
         Who uses it, as the audit log shall say: at most 64 printable characters.
-    scopes : iterable of Scope
-        What it is good for, at least one.
     days : int, optional
         How long it holds; for ever if left out.
-
-    Returns
-    -------
-    record : TokenRecord
-        What is stored.
-    text : str
-        The token. It cannot be retrieved again.
 
     Raises
     ------
@@ -93,13 +84,7 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
 
 
 def check_name_is_free(name: str, there: Iterable[TokenRecord], now_ns: int) -> None:
-    """Refuse a name that the audit log could not tell from another one.
-
-    Raises
-    ------
-    NameTakenError
-        If one of the tokens that are there is valid and has the name.
-    """
+    """Refuse, with NameTakenError, the name of a valid token: the audit log could not tell the two apart."""
     if any(one.name == name and token_state(one, now_ns) == "valid" for one in there):
         raise NameTakenError(f"a token of {name!r} is already valid: choose another name, or revoke it first")
 

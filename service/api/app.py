@@ -1,9 +1,15 @@
-"""The HTTP API of the service; ``docs/api.md`` lists the routes."""
+"""The HTTP API of the service and its OpenAPI description; ``docs/api.md`` lists the routes."""
 
+import threading
+from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Query, Request, Response
+from fastapi.dependencies.models import Dependant
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, PlainTextResponse
+from fastapi.routing import APIRoute, iter_route_contexts
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import AfterValidator, Field, WithJsonSchema
 
@@ -14,16 +20,14 @@ from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
 from rotorwatch.records.monitor import Alive, Readiness, SettingList, WebhookList
 from service.access.guard import Guard
-from service.access.problems import add_problems, problem_answer, problem_responses, responses
-from service.api.description import DescribedApp, only_known_arguments
+from service.access.problems import add_problems, problem_answer, problem_responses, responses, share_problems
 from service.api.routes.events import add_event_routes
 from service.api.routes.history import add_history_routes
 from service.api.routes.operations import add_operation_routes
 from service.api.routes.page import add_docs_routes, add_page_routes
-from service.api.routes.plots import add_plot_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
-from service.api.routes.snapshots import add_snapshot_routes
+from service.api.routes.snapshots import add_plot_routes, add_snapshot_routes
 from service.api.routes.tokens import add_session_routes, add_token_routes
 from service.api.samples import SampleReader
 from service.api.views import PLACE, InPath, ServiceView
@@ -35,19 +39,16 @@ _DESCRIPTION = """Health of rotating machines: which parameter changed, by how m
 Every route listed here except `/healthz` needs a token with its scope. Errors are problem details (RFC 9457).
 Times in ns count from 1970-01-01 UTC.
 """
-_TAGS = [
-    {"name": "machines", "description": "Monitored machines and their state."},
-    {"name": "alarms", "description": "Alarms, and operators' actions on them."},
-    {"name": "history", "description": "Past alarms, reports and readings."},
-    {
-        "name": "snapshots",
-        "description": "Correlations, spectra, orbits and plots, of the newest data or of recordings.",
-    },
-    {"name": "events", "description": "Alarm events and changes of health as they happen."},
-    {"name": "recordings", "description": "Recorded streams."},
-    {"name": "replays", "description": "Recordings evaluated again or published again, apart from live data."},
-    {"name": "service", "description": "The monitor itself."},
-]
+_TAGS = {
+    "machines": "Monitored machines and their state.",
+    "alarms": "Alarms, and operators' actions on them.",
+    "history": "Past alarms, reports and readings.",
+    "snapshots": "Correlations, spectra, orbits and plots, of the newest data or of recordings.",
+    "events": "Alarm events and changes of health as they happen.",
+    "recordings": "Recorded streams.",
+    "replays": "Recordings evaluated again or published again, apart from live data.",
+    "service": "The monitor itself.",
+}
 _SMALLEST_CHANGE = 1e-6
 _METRICS = (
     "# HELP rotorwatch_blocks_accepted_total Blocks accepted\n"
@@ -78,13 +79,75 @@ _Sizeable = Annotated[
 _Change = Annotated[_Sizeable | None, Query(description="relative change to be found, -0.05 for a loss of 5 %")]
 
 
+class DescribedApp(FastAPI):
+    """An application whose description is suitable for code generators.
+
+    Operations have the names of their functions, problems are described once, and examples keep their nulls, which
+    FastAPI would remove.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(generate_unique_id_function=lambda route: route.name, **arguments)
+        self._describing = threading.Lock()
+
+    @cached_property
+    def arguments(self) -> Mapping[Any, frozenset[str]]:
+        """Names of the query arguments that each endpoint takes."""
+        return {
+            context.endpoint: frozenset(_queried(context.dependant))
+            for context in iter_route_contexts(self.routes)
+            if isinstance(context.original_route, APIRoute)
+        }
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the description, built once under a lock, so that no thread sees it incomplete."""
+        with self._describing:
+            if self.openapi_schema is None:
+                self.openapi_schema = self._described()
+            return self.openapi_schema
+
+    def _described(self) -> dict[str, Any]:
+        description = super().openapi()
+        for context in iter_route_contexts(self.routes):
+            routes = description["paths"].get(context.path_format, {})
+            for method in context.methods or ():
+                described = routes.get(method.lower())
+                if described is not None:
+                    _restore(described["responses"], context.responses)
+        share_problems(description)
+        _simplify(description)
+        return description
+
+
+def only_known_arguments(request: Request) -> None:
+    """Refuse a query argument that the route does not have: a misspelt one would otherwise be silently ignored.
+
+    Raises
+    ------
+    RequestValidationError
+        Naming the argument and those of the route.
+    """
+    given = request.query_params.keys()
+    if not given or not request.scope["path"].startswith("/api/") or not isinstance(request.app, DescribedApp):
+        return
+    known = request.app.arguments.get(request.scope.get("endpoint"), frozenset())
+    expected = f"expected one of {', '.join(sorted(known))}" if known else "expected none"
+    faults = [
+        {"loc": ("query", name[:64]), "msg": f"no argument of this route, {expected}"}
+        for name in given
+        if name not in known
+    ]
+    if faults:
+        raise RequestValidationError(faults)
+
+
 def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     """Build the application, which answers from `service` in the server's worker threads."""
     app = DescribedApp(
         title="rotorwatch",
         version=__version__,
         description=_DESCRIPTION,
-        openapi_tags=_TAGS,
+        openapi_tags=[{"name": name, "description": text} for name, text in _TAGS.items()],
         dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
         docs_url=None,  # the default pages load scripts from the internet; those of `add_docs_routes` do not
@@ -193,3 +256,42 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         if readiness.ready:
             return readiness
         return problem_answer(request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json"))
+
+
+def _queried(dependant: Dependant) -> set[str]:
+    """Names of the query arguments of a route, including those of its dependencies."""
+    return {one.alias for one in dependant.query_params}.union(*map(_queried, dependant.dependencies))
+
+
+def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]]) -> None:
+    for status, answer in declared.items():
+        for kind, part in answer.get("content", {}).items():
+            if "example" in part:
+                described[str(status)]["content"][kind]["example"] = part["example"]
+
+
+def _simplify(schema: Any) -> None:
+    """Make a schema smaller and suitable for code generators.
+
+    Adds `items` to every tuple, for generators that do not know `prefixItems`, and removes titles that only repeat the
+    name of a field, and null as a value of optional query arguments, which nobody can send.
+    """
+    if isinstance(schema, list):
+        for one in schema:
+            _simplify(one)
+    elif isinstance(schema, dict):
+        for one in schema.values():
+            _simplify(one)
+        properties, own = schema.get("properties"), schema.get("schema")
+        for field in (*(properties.values() if isinstance(properties, dict) else ()), own):
+            if isinstance(field, dict):
+                field.pop("title", None)
+        if isinstance(own, dict) and own.get("description") == schema.get("description"):  # that of a query argument
+            own.pop("description", None)
+        if isinstance(own, dict) and "in" in schema and isinstance(choice := own.get("anyOf"), list):
+            own["anyOf"] = choice = [one for one in choice if one != {"type": "null"}]
+            if len(choice) == 1:
+                own.update(*own.pop("anyOf"))
+        if isinstance(first := schema.get("prefixItems"), list):
+            different = [one for number, one in enumerate(first) if one not in first[:number]]
+            schema["items"] = different[0] if len(different) == 1 else {"anyOf": different}

@@ -13,14 +13,15 @@ from fastapi import Depends, HTTPException, Query
 
 from models.errors import RotorwatchError
 from models.mistakes import form
-from rotorwatch.records.replays import ReplayJob
 from service.analysis.recorded import Held, Recorded, Sampled
 from service.analysis.recorded_window import recorded_window
 from service.analysis.snapshots.machine import LatestData, MachineSnapshots
 from service.api.routes.recordings import found_recording
+from service.api.routes.replays import installed_for, replayed_report
 from service.api.views import ServiceView, time_query
 from service.monitor.evaluators import evaluator_for
 from service.monitor.reports import identity_of
+from service.recordings.replay.jobs import RunningJob
 from service.recordings.replay.source import RecordingSource
 from service.stream.monitored import Monitored
 
@@ -29,7 +30,6 @@ _PATIENCE_S = 10.0
 _WINDOWS = 4
 _SOURCES = 4
 _ONE_AT_A_TIME = threading.Lock()
-_NO_SAMPLES = "no samples have come in"
 _NONE: list[str] = []
 _Files = tuple[tuple[Path, int], ...]
 
@@ -99,12 +99,7 @@ class SampleReader:
 
     @contextmanager
     def samples(self, view: Monitored, chosen: Chosen, reach_s: float | None = None) -> Iterator[Sampled]:
-        """The selected samples.
-
-        Parameters
-        ----------
-        reach_s : float, optional
-            Length of data before `Chosen.until_ns`, used if `Chosen.since_ns` is not given.
+        """The selected samples; without `Chosen.since_ns`, those of the last `reach_s` before `Chosen.until_ns`.
 
         Raises
         ------
@@ -115,7 +110,7 @@ class SampleReader:
         """
         if not chosen.recorded:
             if not view.latest.blocks:
-                raise RotorwatchError(_NO_SAMPLES)
+                raise RotorwatchError("no samples have come in")
             yield Held(view.machine, view.latest.blocks)
             return
         found = self._files(view, chosen)
@@ -126,35 +121,33 @@ class SampleReader:
             source = _source(found)
             _check_size(source, since_ns, until_ns)
             keys = source.machine(view.machine.title)
-            yield Recorded(source, keys, *source.between(_moment(since_ns), _moment(until_ns), keys))
+            from_, to = (None if time_ns is None else f"{time_ns}ns" for time_ns in (since_ns, until_ns))
+            yield Recorded(source, keys, *source.between(from_, to, keys))
 
     def window(self, view: Monitored, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
         """The selected window, and the object that makes its snapshots; the last few recorded windows are cached.
 
-        Raises
-        ------
-        HTTPException
-            If there is no such recording or replay, or too much data would be read.
+        Raises HTTPException as `samples` does.
         """
         if not chosen.recorded:
             return view.snapshots, view.latest
-        job = None if chosen.replay is None else self._job(view, chosen.replay)
-        asked = (view.machine.title, chosen, None if job is None else job.state)
+        replay = None if chosen.replay is None else self._replay(view, chosen.replay)
+        asked = (view.machine.title, chosen, None if replay is None else replay.view.state)
         found = self._files(view, chosen)
         with _taking_turns():
-            kept = self._windows.pop(asked, None) or self._read(view, chosen, job, found)
+            kept = self._windows.pop(asked, None) or self._read(view, chosen, replay, found)
             self._windows[asked] = kept
             while len(self._windows) > _WINDOWS:
                 self._windows.popitem(last=False)
             return kept
 
     def _read(
-        self, view: Monitored, chosen: Chosen, job: ReplayJob | None, found: _Files
+        self, view: Monitored, chosen: Chosen, replay: RunningJob | None, found: _Files
     ) -> tuple[MachineSnapshots, LatestData]:
         installed, report, until_ns = view.snapshots.installed, None, chosen.until_ns
-        if job is not None and job.mode == "offline":
-            installed = self._service.replays.installed(job)
-            report = None if until_ns is None else self._service.replays.report(job, until_ns)
+        if replay is not None and replay.view.mode == "offline":
+            installed = installed_for(replay)
+            report = None if until_ns is None else replayed_report(replay, until_ns)
         try:
             source = _source(found)
             if until_ns is not None:
@@ -168,16 +161,16 @@ class SampleReader:
     def _files(self, view: Monitored, chosen: Chosen) -> _Files:
         ids = [f"{view.machine.title}/{name}" for name in chosen.recordings]
         if chosen.replay is not None:
-            ids = list(self._job(view, chosen.replay).recordings)
+            ids = list(self._replay(view, chosen.replay).view.recordings)
         found = [found_recording(self._service.catalogue, one) for one in dict.fromkeys(ids)]
         return tuple((one.path, one.size_bytes) for one in found)
 
-    def _job(self, view: Monitored, replay_id: str) -> ReplayJob:
-        job = self._service.replays.found(replay_id).view
-        machine = job.recordings[0].rpartition("/")[0]
+    def _replay(self, view: Monitored, replay_id: str) -> RunningJob:
+        found = self._service.replays.found(replay_id)
+        machine = found.view.recordings[0].rpartition("/")[0]
         if machine != view.machine.title:
             raise HTTPException(422, f"replay: {replay_id} is of {machine}, expected one of {view.machine.title}")
-        return job
+        return found
 
 
 @contextmanager
@@ -201,7 +194,3 @@ def _check_size(source: RecordingSource, since_ns: int | None, until_ns: int | N
     if size > _MOST_BYTES:
         most = f"expected at most {_MOST_BYTES / 1e6:.0f} MB at once"
         raise HTTPException(422, f"recording: {size / 1e6:.0f} MB, {most}")
-
-
-def _moment(time_ns: int | None) -> str | None:
-    return None if time_ns is None else f"{time_ns}ns"

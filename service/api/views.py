@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from service.api.routes.replays import ReplayRequests
 from service.delivery.event_feed import EventFeed
-from service.delivery.metrics.collector import MeasuredService, Metrics
+from service.delivery.metrics import MeasuredService, Metrics
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.settings.service import ServiceSettings
@@ -58,13 +58,7 @@ class ServiceView(MeasuredService, Protocol):
 
 
 def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
-    """Find a machine.
-
-    Raises
-    ------
-    HTTPException
-        404, with a list of the machines.
-    """
+    """Find a machine; HTTPException 404, with a list of the machines, if there is none of this name."""
     machines = {one.machine.title: one for one in service.machines()}
     machine = machines.get(f"{site}/{name}")
     if machine is None:
@@ -73,13 +67,7 @@ def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
 
 
 def check_alarm(view: Monitored, name: str, status: int) -> None:
-    """Refuse an alarm that a machine cannot have.
-
-    Raises
-    ------
-    HTTPException
-        With the given status, and a list of the machine's alarms.
-    """
+    """Refuse an alarm that a machine cannot have; HTTPException with this status, and a list of those it can have."""
     levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
     if name not in ALARMS and name not in levels:
         there = ", ".join((*ALARMS, *levels))

@@ -261,7 +261,7 @@ def test_webhook(
 
     [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
     """
-    from service.delivery.webhooks.webhooks import send_test  # noqa: PLC0415
+    from service.delivery.webhooks.dispatcher import send_test  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
     webhooks = load_settings(config).webhooks
@@ -320,7 +320,7 @@ def _checked(file: Path) -> str:
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
     from service.access.tls import lapses, tls_context  # noqa: PLC0415
-    from service.delivery.webhooks.webhooks import Webhooks  # noqa: PLC0415
+    from service.delivery.webhooks.dispatcher import Webhooks  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 
     fields = read_toml(file)

@@ -56,12 +56,7 @@ def cursor_text(cursor: Mapping[str, int]) -> str:
 
 
 def parsed_cursor(text: str) -> Cursor:
-    """Take the id of an event apart.
-
-    Raises
-    ------
-    CursorError
-        If it is not one.
+    """Take the id of an event apart; CursorError if it is not one.
 
     Examples
     --------
@@ -87,15 +82,6 @@ class _Listener:
     news: asyncio.Event = field(default_factory=asyncio.Event)
     woken: bool = False
 
-    def wake(self) -> None:
-        if not self.woken:
-            self.woken = True
-            self.loop.call_soon_threadsafe(self.news.set)
-
-    def reset(self) -> None:
-        self.woken = False
-        self.news.clear()
-
 
 @dataclass(frozen=True, eq=False)
 class _Said:
@@ -106,11 +92,14 @@ class _Said:
 
     @cached_property
     def whole(self) -> str:
-        return _health_event_text(self.health, in_full=True)
+        return f"event: health\ndata: {self.health.model_dump_json()}\n\n"
 
     @cached_property
     def overview(self) -> str:
-        return _health_event_text(self.health, in_full=False)
+        return f"event: overview\ndata: {overview(self.health).model_dump_json()}\n\n"
+
+    def text(self, *, in_full: bool) -> str:
+        return self.whole if in_full else self.overview
 
 
 class EventFeed:
@@ -127,7 +116,9 @@ class EventFeed:
         """Say that alarm events were committed."""
         with self._lock:
             for listener in self._listeners:
-                listener.wake()
+                if not listener.woken:
+                    listener.woken = True
+                    listener.loop.call_soon_threadsafe(listener.news.set)
 
     def health(self, health: Health) -> None:
         """Say that a machine's health has changed."""
@@ -136,8 +127,7 @@ class EventFeed:
             self._number += 1
             self._health.pop(place, None)
             self._health[place] = _Said(self._number, health)
-            for listener in self._listeners:
-                listener.wake()
+            self.wake()
 
     def close(self) -> None:
         """End every stream once it has sent what is committed; slow readers are waited for `_LAST_S` at most."""
@@ -178,7 +168,8 @@ class EventFeed:
             asked_s = time.monotonic()
             while True:
                 closes = self.closed
-                listener.reset()
+                listener.woken = False
+                listener.news.clear()
                 behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
                 for place in behind:
                     async for event in self._alarm_events(place, logs[place], cursor):
@@ -224,9 +215,9 @@ class EventFeed:
             return
         told[place] = latest.number
         if first:
-            yield await run_in_threadpool(lambda: _health_event_text(health(place), in_full=in_full))
+            yield await run_in_threadpool(lambda: _Said(latest.number, health(place)).text(in_full=in_full))
         else:
-            yield latest.whole if in_full else latest.overview
+            yield latest.text(in_full=in_full)
 
     async def _alarm_events(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
         """Events in the log after the cursor, which moves along; none while the history cannot be read."""
@@ -240,10 +231,3 @@ class EventFeed:
                 yield f"id: {cursor_text(cursor)}\nevent: alarm\ndata: {event.text}\n\n"
             if not page:
                 return
-
-
-def _health_event_text(health: Health, *, in_full: bool) -> str:
-    """Health as an event."""
-    if in_full:
-        return f"event: health\ndata: {health.model_dump_json()}\n\n"
-    return f"event: overview\ndata: {overview(health).model_dump_json()}\n\n"

@@ -134,10 +134,7 @@ def _make(file: Path) -> None:
 def faults(file: Path) -> tuple[str, ...]:
     """What is wrong with a file; empty if it is a whole history. Takes seconds for each gigabyte.
 
-    Raises
-    ------
-    StoreError
-        If it cannot be opened.
+    Raises StoreError if it cannot be opened.
     """
     try:
         with closing(_opened(file)) as connection:
@@ -155,10 +152,7 @@ def faults(file: Path) -> tuple[str, ...]:
 def back_up(file: Path, copy: Path) -> None:
     """Copy a history, also while a monitor writes it; the copy is whole or not there.
 
-    Raises
-    ------
-    StoreError
-        If the copy is there already, or cannot be made.
+    Raises StoreError if the copy is there already, or cannot be made.
     """
     try:
         os.close(os.open(copy, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))

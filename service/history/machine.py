@@ -40,13 +40,10 @@ class MachineStore:
     database fails; they see what is committed.
     """
 
-    def __init__(
-        self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int], bucket_ns: int
-    ) -> None:
+    def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
         self.title = claim.title
         self.report_log = ReportLog(database, claim.site, claim.name)
         self._database = database
-        self._bucket_ns = bucket_ns
         self._writer = writer
         self._claim = claim
         self._now_ns = now_ns
@@ -261,7 +258,7 @@ class MachineStore:
             At most this many buckets for each name; those without a reading are left out.
         """
         with self._database.reading() as connection:
-            of = connection, self._claim.machine_id, self._bucket_ns
+            of = connection, self._claim.machine_id, self._writer.bucket_ns
             return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
 
     def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[StoredBucket, ...]:
@@ -270,7 +267,7 @@ class MachineStore:
         newest = select(window.end_ns).where(window.machine_id == self._claim.machine_id)
         with self._database.reading() as connection:
             end_ns = connection.scalar(newest.order_by(window.end_ns.desc()).limit(1))
-            of = connection, self._claim.machine_id, self._bucket_ns
+            of = connection, self._claim.machine_id, self._writer.bucket_ns
             since_ns = max(0, (end_ns or 0) - span_ns)
             return trend(*of, quantity, [name], since_ns, None, _checked(points))
 

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 
 import structlog
-from sqlalchemy import Connection, Table, delete, func, select, text, update
+from sqlalchemy import Connection, Table, delete, func, select, update
 
 from service.history.age import AgeClock
 from service.history.database import Database
@@ -75,10 +75,8 @@ class Reduction:
 
     def _batch(self, table: Table, until_ns: int) -> int:
         with self._database.writing() as connection:
-            if not self._database.is_sqlite:
-                lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
-                if not connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
-                    return 0  # another monitor is at it
+            if not (self._database.is_sqlite or connection.scalar(select(func.pg_try_advisory_xact_lock(*_LOCK)))):
+                return 0  # another monitor is at it
             if table is not buckets:
                 numbers = connection.scalars(select(machines.c.machine_id).order_by(machines.c.machine_id)).all()
                 most = max(1, _BATCH // max(1, len(numbers)))

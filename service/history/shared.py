@@ -1,5 +1,6 @@
 """What belongs to no single machine: tokens, audit log, cursors of webhooks; and alarms and reports to read."""
 
+from dataclasses import asdict
 from typing import Any
 
 from sqlalchemy import func, insert, select, update
@@ -55,9 +56,8 @@ class ReportLog:
 
     def span_ns(self) -> tuple[int, int] | None:
         """When the oldest and the newest window end; None if there are no reports."""
-        ((first, last),) = self._database.rows(
-            select(func.min(reports.c.end_ns), func.max(reports.c.end_ns)).where(*self._own)
-        )
+        query = select(func.min(reports.c.end_ns), func.max(reports.c.end_ns)).where(*self._own)
+        ((first, last),) = self._database.rows(query)
         return None if first is None else (first, last)
 
     def texts(self, since_ns: int, until_ns: int, most: int) -> list[str]:
@@ -86,8 +86,7 @@ class AuditLog:
         storable = {name: _storable(text) for name, text in texts.items()}
         entry = insert(audit_log).values(at_ns=at_ns, status=status, **storable)
         with self._database.writing() as connection:
-            made = connection.execute(entry.returning(audit_log.c.number))
-            number: int = made.scalar_one()
+            number: int = connection.execute(entry.returning(audit_log.c.number)).scalar_one()
         return number
 
     def entries(
@@ -102,10 +101,8 @@ class AuditLog:
         query = select(*_ENTRY).order_by(audit_log.c.number.desc()).limit(limit)
         if before is not None:
             query = query.where(audit_log.c.number < before)
-        if machine is not None:
-            query = query.where(audit_log.c.machine == machine)
-        if actor is not None:
-            query = query.where(audit_log.c.actor == actor)
+        for column, value in ((audit_log.c.machine, machine), (audit_log.c.actor, actor)):
+            query = query if value is None else query.where(column == value)
         return tuple(AuditRecord.model_validate(dict(row._mapping)) for row in self._database.rows(query))
 
 
@@ -133,8 +130,7 @@ class TokenStore:
         """
         if any(not scope or scope.split() != [scope] for scope in record.scopes):
             raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
-        values = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
-        values["scopes"] = " ".join(record.scopes)
+        values = asdict(record) | {"scopes": " ".join(record.scopes)}
         with self._database.writing() as connection:
             there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)
             if connection.scalar(there) is not None:

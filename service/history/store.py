@@ -82,8 +82,7 @@ class Store:
         shared: bool = False,
     ) -> None:
         self._database = Database(url, timeout_s)
-        self._bucket_ns = retention.bucket_s * 10**9
-        self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns, shared=shared)
+        self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9, shared=shared)
         self._shared = shared
         self.reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
@@ -122,12 +121,8 @@ class Store:
     def open(self, *, set_aside: bool = False) -> None:
         """Connect, and bring the tables up to date; a store is opened once.
 
-        An SQLite file that is damaged is renamed and a new one begun, if it may be `set_aside`; `lost` says so.
-
-        Raises
-        ------
-        StoreError
-            If the database cannot be reached or used.
+        An SQLite file that is damaged is renamed and a new one begun, if it may be `set_aside`; `lost` says so. Raises
+        StoreError if the database cannot be reached or used.
         """
         self._database.start(set_aside, read_only=self._shared)
         self._writer.start()
@@ -154,28 +149,21 @@ class Store:
     def machine(self, site: str, name: str) -> MachineStore:
         """The history of a machine, which nobody else writes until this store is closed or its process ends.
 
-        Raises
-        ------
-        StoreError
-            If another monitor writes it, or the database fails.
+        Raises StoreError if another monitor writes it, or the database fails.
         """
-        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns, self._bucket_ns)
+        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns)
 
     def reader(self, site: str, name: str) -> MachineStore:
         """The history of a machine that another process of this monitor writes, to be read.
 
-        Raises
-        ------
-        StoreError
-            If there is none, or the database fails.
+        Raises StoreError if there is none, or the database fails.
         """
-        found = self._database.rows(
-            select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
-        )
+        query = select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
+        found = self._database.rows(query)
         if not found:
             raise StoreError(f"{self.shown}: there is no history of {site}/{name}")
         claim = Claim(site, name, most_reports=0, machine_id=found[0][0])
-        return MachineStore(self._database, self._writer, claim, self._now_ns, self._bucket_ns)
+        return MachineStore(self._database, self._writer, claim, self._now_ns)
 
     def status(self) -> HistoryStatus:
         """How large the history is, and how far back it goes. Raises StoreError if the database fails."""

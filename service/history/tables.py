@@ -230,21 +230,17 @@ def bring_up_to_date(connection: sa.Connection) -> None:
             f"the database holds a table {min(others)!r} not of the history: give the history a database of its own"
         )
     elif not found:
-        _create(connection)
+        metadata.create_all(connection, checkfirst=False)
+        for statement in (
+            *(_SQLITE_TRIGGERS if connection.dialect.name == "sqlite" else _POSTGRESQL_TRIGGERS),
+            "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
+            "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))",
+            f"INSERT INTO alembic_version VALUES ('{REVISION}')",  # noqa: S608  # ours
+        ):
+            connection.execute(sa.text(statement))
 
 
 def _revisions(connection: sa.Connection) -> list[str]:
     if not sa.inspect(connection).has_table("alembic_version"):
         return []
     return list(connection.scalars(sa.text("SELECT version_num FROM alembic_version")))
-
-
-def _create(connection: sa.Connection) -> None:
-    metadata.create_all(connection, checkfirst=False)
-    for statement in (
-        *(_SQLITE_TRIGGERS if connection.dialect.name == "sqlite" else _POSTGRESQL_TRIGGERS),
-        "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
-        "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))",
-        f"INSERT INTO alembic_version VALUES ('{REVISION}')",  # noqa: S608  # ours
-    ):
-        connection.execute(sa.text(statement))

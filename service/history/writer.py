@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
 
 import structlog
-from sqlalchemy import Connection, select, text, update
+from sqlalchemy import Connection, func, select, text, update
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
@@ -42,7 +42,7 @@ class Writer:
         self._database = database
         self._retry_s = retry_s
         self._most_reports = most_reports
-        self._bucket_ns = bucket_ns
+        self.bucket_ns = bucket_ns
         self._shared = shared
         self._claims: list[Claim] = []
         self._files = ExitStack()
@@ -74,12 +74,8 @@ class Writer:
         if not self._thread.is_alive():
             self._let_go()
         self._files.close()
-        lost = [
-            f"{claim.title}: {claim.contents()} ({self.trouble or claim.trouble})"
-            for claim in self._claims
-            if claim.steps
-        ]
-        if lost:
+        left = [claim for claim in self._claims if claim.steps]
+        if lost := [f"{claim.title}: {claim.contents()} ({self.trouble or claim.trouble})" for claim in left]:
             raise StoreError(f"could not be written before the end, and is lost: {'; '.join(lost)}")
 
     def claim(self, site: str, name: str) -> Claim:
@@ -147,7 +143,7 @@ class Writer:
         """Write one transaction; say whether the database has taken all of it."""
         try:
             with self._connected() as connection, connection.begin():
-                refused, series = write_group(self._database, connection, ready, self._series, self._bucket_ns)
+                refused, series = write_group(self._database, connection, ready, self._series, self.bucket_ns)
         except Exception as error:
             # Nothing narrower: whatever a driver raises, this thread must go on, or no machine would be written again.
             why = str(self._database.failure(error))
@@ -163,17 +159,15 @@ class Writer:
         self._series.update(series)
         with self._lock:
             for claim in ready:
-                self._settle(claim, refused.get(claim))
+                bundle, claim.attempt, claim.trouble = claim.attempt, StepBundle(), ""
+                refusal = refused.get(claim)
+                if refusal is None:
+                    claim.written += 1
+                elif not bundle.heard:
+                    _log.error("a step was refused", why=str(refusal))
+                bundle.settle(refusal, written=True)
             self._recover()
         return True
-
-    def _settle(self, claim: Claim, refused: StoreError | None) -> None:
-        bundle, claim.attempt, claim.trouble = claim.attempt, StepBundle(), ""
-        if refused is None:
-            claim.written += 1
-        elif not bundle.heard:
-            _log.error("a step was refused", why=str(refused))
-        bundle.settle(refused, written=True)
 
     def _in_place(self) -> bool:
         """Whether the database is at its address; one that was deleted, replaced or damaged is begun anew."""
@@ -196,10 +190,8 @@ class Writer:
                     self._take_again(connection, claim)
         except Exception as error:
             # As in `_write`: this thread must go on, and try again.
-            self._fail(
-                self._claims,
-                f"{why or self._database.news}; a new one could not be begun: {self._database.failure(error)}",
-            )
+            failure = f"a new one could not be begun: {self._database.failure(error)}"
+            self._fail(self._claims, f"{why or self._database.news}; {failure}")
             return False
         _log.error("the history continues in another file", why=self._database.news)
         self._recover()
@@ -338,5 +330,4 @@ def _is_operational(error: Exception) -> bool:
 
 
 def _lock_row(connection: Connection, machine_id: int) -> bool:
-    query = text("SELECT pg_try_advisory_lock(:high, :low)")
-    return bool(connection.scalar(query, {"high": _LOCK, "low": machine_id}))
+    return bool(connection.scalar(select(func.pg_try_advisory_lock(_LOCK, machine_id))))

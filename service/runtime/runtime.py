@@ -21,9 +21,8 @@ from service.api.app import create_app
 from service.api.routes.replays import ReplayRequests
 from service.api.server import HttpError, HttpServer
 from service.delivery.event_feed import EventFeed
-from service.delivery.metrics.collector import Metrics
-from service.delivery.metrics.requests import RequestCounts, RequestMeter
-from service.delivery.webhooks.webhooks import Webhooks
+from service.delivery.metrics import Metrics, RequestCounts, RequestMeter
+from service.delivery.webhooks.dispatcher import Webhooks
 from service.history.records import StoreError
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue

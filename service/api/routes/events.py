@@ -55,24 +55,20 @@ _InFull = Annotated[
 ]
 
 
-def stream_example() -> str:
-    """Example of a stream of server-sent events."""
+def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the route."""
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
-    return (
+    stream = (
         "retry: 2000\nid: demo/lab=-1\nevent: start\ndata: {}\n\n"
         f"id: demo/lab=0\nevent: alarm\ndata: {event.model_dump_json()}\n\n"
     )
-
-
-def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
-    """Add the route."""
 
     @app.get(
         "/api/v1/events",
         tags=["events"],
         response_class=StreamingResponse,
         responses={
-            200: {"content": {"text/event-stream": {"schema": {"type": "string"}, "example": stream_example()}}},
+            200: {"content": {"text/event-stream": {"schema": {"type": "string"}, "example": stream}}},
             **problem_responses(404, 409, 422),
         },
     )
@@ -88,7 +84,10 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         """Alarm events from the history, each once and in the order of its machine's log, and changes of health."""
         if service.feed.closed:
             raise HTTPException(503, "the service is being stopped")
-        logs = _logs(service, machine)
+        there = {one.machine.title: one.history for one in service.machines()}
+        if unknown := [place for place in machine if place not in there]:
+            raise HTTPException(404, f"no machine {unknown[0][:129]}; there are: {', '.join(there)}")
+        logs = {place: log for place, log in there.items() if place in machine or not machine}
         cursor = _cursor(logs, (header or "", last_event_id or ""), from_)
 
         async def admitted() -> bool:
@@ -105,14 +104,6 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
             media_type="text/event-stream",
             headers={"X-Accel-Buffering": "no"},
         )
-
-
-def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, MachineStore]:
-    there = {one.machine.title: one.history for one in service.machines()}
-    unknown = next((place for place in wanted if place not in there), None)
-    if unknown is not None:
-        raise HTTPException(404, f"no machine {unknown[:129]}; there are: {', '.join(there)}")
-    return {place: log for place, log in there.items() if place in wanted or not wanted}
 
 
 def _cursor(logs: Mapping[str, MachineStore], texts: tuple[str, ...], begin: str) -> Cursor:

@@ -3,7 +3,7 @@
 import re
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
+from fastapi import FastAPI, Header, HTTPException, Path, Query, Request, Response
 
 from models.errors import RotorwatchError
 from models.mistakes import form
@@ -20,7 +20,7 @@ from rotorwatch.records.operations import (
 )
 from service.access.audit import AuditNote
 from service.access.guard import Guard
-from service.access.problems import responses
+from service.access.problems import responses, shown_body
 from service.access.scopes import Caller
 from service.api.views import PLACE, AlarmName, InPath, MachineName, ServiceView, SiteName, check_alarm, found_machine
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
@@ -69,12 +69,6 @@ _IfMatch = Annotated[
 
 def add_operation_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     """Add the routes; those of alarm events must be added before, or ``events`` would be taken for an alarm's name."""
-    _add_reading_routes(app, service, guard)
-    for kind in _TEXTS:
-        _add_operation(app, service, guard, kind)
-
-
-def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["alarms"], "dependencies": [guard.read]}
 
     @app.get(f"{PLACE}/alarms", responses=responses(AlarmStates, 404, 422), **common)
@@ -101,11 +95,13 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         """One alarm; the header ETag has its version."""
         return _marked(_present(found_machine(service, site, machine), name), response)
 
+    for kind in _TEXTS:
+        _add_operation(app, service, guard, kind)
+
 
 def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: OperationKind) -> None:
     configures = kind in ("remove-from-service", "return-to-service")
     model: Any = _ORDERS.get(kind, OperationOrder)
-    shown = {"example": {"summary": "as seen in the control room", "value": example(model)}}
 
     @app.post(
         f"{PLACE}/alarms/{{name}}/{kind}",
@@ -123,7 +119,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         machine: MachineName,
         name: _Alarm,
         caller: Annotated[Caller, guard.configure if configures else guard.operate],
-        posted: Annotated[model, Body(openapi_examples=shown)],
+        posted: Annotated[model, shown_body("as seen in the control room", example(model))],
         if_match: _IfMatch = None,
     ) -> OperationDone:
         order: _Order = posted
@@ -133,6 +129,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             raise HTTPException(
                 428, "state how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
             )
+        version = re.search(r"-?[0-9]+", if_match or "")  # a compressing proxy may have made a weak ETag of it
         operation = OperatorAction(
             kind=kind,
             alarm=name,
@@ -141,7 +138,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             duration_s=order.duration_s if isinstance(order, ShelveOrder) else None,
             one_shot=order.one_shot if isinstance(order, ShelveOrder) else False,
             expected_state=None if order.expected_state is None else order.expected_state.value,
-            expected_version=_version(if_match),
+            expected_version=None if version is None else int(version[0]),
         )
         try:
             events = view.operate(operation)
@@ -163,9 +160,3 @@ def _present(view: Monitored, name: str) -> Alarm:
 def _marked(alarm: Alarm, response: Response) -> Alarm:
     response.headers["ETag"] = f'"{alarm.version}"'
     return alarm
-
-
-def _version(if_match: str | None) -> int | None:
-    """Version in an ETag, which a compressing proxy may have turned into a weak one."""
-    found = re.search(r"-?[0-9]+", if_match or "")
-    return None if found is None else int(found[0])

@@ -138,13 +138,7 @@ class _RecordingFile(FileResponse):
 
 
 def found_recording(index: Catalogue | None, recording_id: str) -> Recording:
-    """Find a recording.
-
-    Raises
-    ------
-    HTTPException
-        404 if there is no such recording, or no directory for recordings is set.
-    """
+    """Find a recording; HTTPException 404 if there is none, or no directory for recordings is set."""
     found = _present(index).find(recording_id)
     if found is None:
         raise HTTPException(404, f"no recording {recording_id}")

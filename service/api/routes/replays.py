@@ -10,9 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Body, Depends, FastAPI, HTTPException, Query
+from fastapi import Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel
 
 from models.commissioning.commissioned import FILE as COMMISSIONED
 from models.commissioning.commissioned import Installed
@@ -35,7 +34,7 @@ from rotorwatch.records.replays import (
     ReplaySeek,
 )
 from service.access.guard import Guard
-from service.access.problems import problem_responses, responses
+from service.access.problems import problem_responses, responses, shown_body
 from service.api.routes.recordings import found_recording
 from service.recordings.catalogue import Catalogue
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, RunningJob, TooManyReplaysError
@@ -74,13 +73,7 @@ class ReplayRequests:
         return is_loopback(self._settings.http.host) if wish is None else wish
 
     def start(self, request: ReplayRequest) -> ReplayJob:
-        """Start a replay.
-
-        Raises
-        ------
-        HTTPException
-            If the request is invalid or cannot be fulfilled.
-        """
+        """Start a replay; HTTPException if the request is invalid or cannot be fulfilled."""
         recordings = [found_recording(self._index, name) for name in request.recordings]
         for recording in recordings:
             if not recording.complete or recording.problem:
@@ -146,30 +139,6 @@ class ReplayRequests:
             raise HTTPException(404, f"no replay {replay_id}; the latest {kept} are kept, until the service stops")
         return found
 
-    def installed(self, job: ReplayJob) -> Installed:
-        """Machine file and bundle of an offline replay.
-
-        Raises
-        ------
-        HTTPException
-            404 if they cannot be read any more.
-        """
-        keys = MachineKeys(*job.recordings[0].split("/")[:2])
-        found = self.jobs.find(job.id)
-        sent = None if found is None else found.machine_file
-        try:
-            return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
-        except RotorwatchError as error:  # its text has the file's path, which must not be shown over HTTP
-            raise HTTPException(404, f"what replay {job.id} was evaluated with can no longer be read") from error
-
-    def report(self, job: ReplayJob, end_ns: int) -> Report | None:
-        """Report of an offline replay on the window that ends at `end_ns`, which may be rounded to a microsecond."""
-        for message in _messages(self.jobs.find(job.id), "/report"):
-            end = _END.search(message)
-            if end is not None and abs(int(end[1]) - end_ns) < _SAME_NS:
-                return Report.model_validate_json(message)
-        return None
-
     def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
         """Machine as FILE or FILE@BUNDLE; None if it is to be chosen by the recorded name."""
         monitored = self._monitored
@@ -214,6 +183,25 @@ class ReplayRequests:
         return {entry.load().title: entry for entry in self._settings.machines}
 
 
+def installed_for(replay: RunningJob) -> Installed:
+    """Machine file and bundle of an offline replay; HTTPException 404 if they cannot be read any more."""
+    job = replay.view
+    keys = MachineKeys(*job.recordings[0].split("/")[:2])
+    try:
+        return choose_machine(keys, replay.machine_file or job.machine, "\n".join(job.changes))
+    except RotorwatchError as error:  # its text has the file's path, which must not be shown over HTTP
+        raise HTTPException(404, f"what replay {job.id} was evaluated with can no longer be read") from error
+
+
+def replayed_report(replay: RunningJob, end_ns: int) -> Report | None:
+    """Report of an offline replay on the window that ends at `end_ns`, which may be rounded to a microsecond."""
+    for message in _messages(replay, "/report"):
+        end = _END.search(message)
+        if end is not None and abs(int(end[1]) - end_ns) < _SAME_NS:
+            return Report.model_validate_json(message)
+    return None
+
+
 def _check_changes(request: ReplayRequest, machine: str | None) -> None:
     """Check changes before the replay starts; if only the recording names the machine, the replay checks them fully."""
     if request.changes and request.mode != "offline":
@@ -235,7 +223,7 @@ def add_replay_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
     _add_changing_routes(app, desk, guard)
 
 
-NothingToSay = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
+NothingToSay = Annotated[NoOrder, shown_body("nothing to say", {})]
 _Offset = Annotated[int, Query(ge=0, description="leave out this many, the oldest")]
 _Every = Annotated[int, Query(ge=1, le=100_000, description="of the rest, only every n-th, for a plot")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
@@ -285,12 +273,16 @@ def _add_reading_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> Non
 
 
 def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> None:
-    common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.operate, Depends(_switch(desk))]}
+    def enabled() -> None:
+        if not desk.enabled:
+            raise HTTPException(403, "replays over HTTP are disabled in the settings ([replay] enabled)")
+
+    common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.operate, Depends(enabled)]}
     problems = (400, 404, 413, 415, 422)
 
     @app.post(_PLACE, status_code=201, responses=responses(ReplayJob, *problems, 409, status_code=201), **common)
     def start_replay(
-        request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],
+        request: Annotated[ReplayRequest, shown_body("an hour of yesterday", example(ReplayRequest))],
     ) -> ReplayJob:
         """Start a replay, in a process of its own."""
         return desk.start(request)
@@ -316,24 +308,10 @@ def _add_changing_routes(app: FastAPI, desk: ReplayRequests, guard: Guard) -> No
 
     @app.post(f"{_JOB}/seek", responses=responses(ReplayJob, *problems, 409), **common)
     def seek_in_replay(
-        replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
+        replay_id: str, place: Annotated[ReplaySeek, shown_body("to a time", example(ReplaySeek))]
     ) -> ReplayJob:
         """Continue a paced replay from another position; a monitor ignores data that it has already received."""
         return _order(desk, replay_id, f"seek {place.to_ns if place.by_s is None else f'{place.by_s:+f}'}")
-
-
-def _shown(summary: str, model: type[BaseModel]) -> Any:
-    return {"example": {"summary": summary, "value": example(model)}}
-
-
-def _switch(desk: ReplayRequests) -> Callable[[], None]:
-    """Refuse everything if replays are switched off."""
-
-    def check() -> None:
-        if not desk.enabled:
-            raise HTTPException(403, "replays over HTTP are disabled in the settings ([replay] enabled)")
-
-    return check
 
 
 def _order(desk: ReplayRequests, replay_id: str, order: str) -> ReplayJob:
@@ -358,8 +336,8 @@ def _results(
     return found, next((number for number, _ in chosen), None)
 
 
-def _messages(job: RunningJob | None, topic: str) -> Iterator[str]:
-    if job is None or not job.results.exists():
+def _messages(job: RunningJob, topic: str) -> Iterator[str]:
+    if not job.results.exists():
         return
     with job.results.open(encoding="utf-8") as lines:
         for line in lines:

@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, HTTPException, Path, Request, Response
+from fastapi import FastAPI, HTTPException, Path, Request, Response
 
 from models.errors import MachineFileError
 from rotorwatch.records.example import example
@@ -15,7 +15,7 @@ from rotorwatch.records.monitor import CallerRights, TokenCreated, TokenEntry, T
 from service.access.audit import AuditNote
 from service.access.credentials import COOKIE, presented_text
 from service.access.guard import Guard
-from service.access.problems import responses
+from service.access.problems import responses, shown_body
 from service.access.scopes import NOBODY, Caller, Scope
 from service.access.tokens import NameTakenError, check_name_is_free, masked, new_token, token_state
 from service.api.routes.replays import NothingToSay
@@ -23,7 +23,6 @@ from service.history.records import TokenRecord
 
 _PLACE = "/api/v1/tokens"
 _ID = Annotated[str, Path(description="public part of the token", examples=["3fK09aZqT1xB"])]
-_SHOWN: Any = {"example": {"summary": "for the control room", "value": example(TokenRequest)}}
 
 
 def add_token_routes(app: FastAPI, guard: Guard) -> None:
@@ -45,7 +44,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
     def create_token(
         request: Request,
         caller: Annotated[Caller, guard.configure],
-        wish: Annotated[TokenRequest, Body(openapi_examples=_SHOWN)],
+        wish: Annotated[TokenRequest, shown_body("for the control room", example(TokenRequest))],
     ) -> TokenCreated:
         """Create a token; only this answer shows its text, because only a hash of it is kept."""
         scopes = frozenset(Scope(one) for one in wish.scopes)

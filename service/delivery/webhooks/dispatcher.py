@@ -1,4 +1,4 @@
-"""Sends one webhook's events: in order for each machine, each until it is taken, remembering how far it has come.
+"""Webhooks: each sends its events in order for each machine, each until it is taken, remembering how far it has come.
 
 ::
 
@@ -10,23 +10,26 @@
 The cursor is saved after the delivery: a monitor that is killed in between delivers the event again, with the same id.
 """
 
+import json
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from secrets import SystemRandom
 
 from pydantic import ValidationError
 
+from models.errors import RotorwatchError
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.monitor import WebhookStatus
-from service.delivery.webhooks.answer import Meaning, pause_s
-from service.delivery.webhooks.receiver import Receiver
+from rotorwatch.records.monitor import WebhookList, WebhookStatus
+from service.delivery.webhooks.receiver import Meaning, Receiver, pause_s
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoreError
 from service.history.shared import WebhookCursors
+from service.monitor.conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 from service.terminal.logs import Limiter, logger
 
@@ -186,14 +189,14 @@ class Dispatcher:
         if lane.next is None:
             saved = self._cursors.get(self.settings.name, lane.place)
             lane.next, lane.saved = (lane.newest + 1, -1) if saved < 0 else (saved, saved)
-        self._save(lane, lane.next)
+        self._save(lane)
         while not lane.waiting and lane.next <= lane.log.last_sequence():
             page = lane.log.events(after=lane.next - 1, limit=_PAGE)
             if not page:
                 break
             lane.waiting.extend(event for event in page if self._wants(event))
             lane.next = lane.waiting[0].sequence if lane.waiting else page[-1].sequence + 1
-            self._save(lane, lane.next)
+            self._save(lane)
         return lane.waiting[0] if lane.waiting else None
 
     def _wants(self, event: StoredEvent) -> bool:
@@ -202,7 +205,10 @@ class Dispatcher:
             return False
         if settings.severities and event.severity not in settings.severities:
             return False
-        return not settings.annunciated_only or _annunciated(event)
+        try:
+            return not settings.annunciated_only or AlarmCloudEvent.model_validate_json(event.text).data.annunciated
+        except ValidationError:  # written by another version of the program: rather one too many than one too few
+            return True
 
     def _attempt(self, lane: _Lane, event: StoredEvent) -> None:
         answer = self._receiver.post(event.id, event.text.encode())
@@ -237,15 +243,15 @@ class Dispatcher:
         lane.next = lane.waiting[0].sequence if lane.waiting else event.sequence + 1
         self._delivered += 1
         self._last_delivered_ns = self._now_ns()
-        self._save(lane, lane.next)
+        self._save(lane)
 
-    def _save(self, lane: _Lane, sequence: int) -> None:
+    def _save(self, lane: _Lane) -> None:
         """Remember how far a machine's events have come; if that fails, later: at worst some are delivered twice."""
-        if lane.saved == sequence or self._clock() < self._save_due_s:
+        if lane.next is None or lane.saved == lane.next or self._clock() < self._save_due_s:
             return
         try:
-            self._cursors.set(self.settings.name, lane.place, sequence)
-            lane.saved = sequence
+            self._cursors.set(self.settings.name, lane.place, lane.next)
+            lane.saved = lane.next
         except StoreError as error:
             self._save_due_s = self._clock() + _AGAIN_S
             self._note_store_error(error)
@@ -258,8 +264,65 @@ class Dispatcher:
         self._last_error, self._last_error_ns = error, self._now_ns()
 
 
-def _annunciated(event: StoredEvent) -> bool:
-    try:
-        return AlarmCloudEvent.model_validate_json(event.text).data.annunciated
-    except ValidationError:  # written by another version of the program: rather one too many than one too few
-        return True
+class Webhooks:
+    """Starts and stops webhooks and reports their states; MachineFileError if a secret or certificate is unusable."""
+
+    def __init__(self, webhooks: Sequence[WebhookSettings]) -> None:
+        self._receivers = [(settings, Receiver(settings)) for settings in webhooks]
+        self._dispatchers: tuple[Dispatcher, ...] = ()
+
+    def start(self, logs: Mapping[str, MachineStore], cursors: WebhookCursors) -> None:
+        """Begin to send from logs by ``site/machine``; webhooks without cursors get what comes after this moment."""
+        self._dispatchers = tuple(
+            Dispatcher(settings, receiver, logs, cursors) for settings, receiver in self._receivers
+        )
+        for dispatcher in self._dispatchers:
+            dispatcher.start()
+
+    def wake(self) -> None:
+        """Say that alarm events were committed; for any thread."""
+        for dispatcher in self._dispatchers:
+            dispatcher.wake()
+
+    def statuses(self) -> WebhookList:
+        """State of every webhook."""
+        return WebhookList(webhooks=tuple(dispatcher.status() for dispatcher in self._dispatchers))
+
+    def failing(self) -> tuple[str, ...]:
+        """Those that do not work, each with what is wrong."""
+        return tuple(
+            f"{status.name}: {status.last_error}" for status in self.statuses().webhooks if status.state != "working"
+        )
+
+    def close(self) -> None:
+        """Give up what is under way; it is sent after the next start."""
+        for dispatcher in self._dispatchers:
+            dispatcher.stop()
+
+
+def send_test(settings: WebhookSettings) -> float:
+    """Send an event that is no alarm (type ``org.rotorwatch.webhook.test``) and return how long it took, in seconds.
+
+    Raises
+    ------
+    MachineFileError
+        If the secret or certificate cannot be used.
+    RotorwatchError
+        If the receiver did not take it.
+    """
+    now_ns = time.time_ns()
+    event = {
+        "specversion": "1.0",
+        "id": f"test/{now_ns}",
+        "source": "/rotorwatch",
+        "type": "org.rotorwatch.webhook.test",
+        "time": rfc3339(now_ns),
+        "datacontenttype": "application/json",
+        "data": {"webhook": settings.name, "text": "This is a test: no machine has raised an alarm."},
+    }
+    begin_s = time.monotonic()
+    with closing(Receiver(settings)) as receiver:
+        answer = receiver.post(f"test/{now_ns}", json.dumps(event).encode())
+    if answer.meaning is not Meaning.DELIVERED:
+        raise RotorwatchError(f"{settings.name}: {settings.target} did not accept the test event: {answer.text}")
+    return time.monotonic() - begin_s

@@ -33,13 +33,7 @@ def new_secret() -> str:
 
 
 def parse_secret(text: str) -> bytes:
-    """The key in a secret.
-
-    Raises
-    ------
-    MachineFileError
-        If it is none; the message does not show it.
-    """
+    """The key in a secret; MachineFileError if it is none, whose message does not show it."""
     encoded = text.removeprefix(PREFIX)
     try:
         key = base64.b64decode(encoded, validate=True)

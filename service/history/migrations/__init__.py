@@ -16,10 +16,7 @@ FOLDER = Path(__file__).parent
 def migrate(connection: Connection) -> None:
     """Run the migrations that are missing, in the transaction of the connection.
 
-    Raises
-    ------
-    StoreError
-        If the tables are of a newer version, or of one before 0.1.0.
+    Raises StoreError if the tables are of a newer version, or of one before 0.1.0.
     """
     config = Config()
     config.set_main_option("script_location", str(FOLDER).replace("%", "%%"))

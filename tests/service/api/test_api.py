@@ -18,7 +18,7 @@ from rotorwatch.records.machines import DetectableChanges, MachineConfiguration
 from rotorwatch.records.monitor import CallerRights
 from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.access.scopes import Scope
-from service.api.description import DescribedApp
+from service.api.app import DescribedApp
 from service.api.routes.page import page_files
 from service.history.records import Step, StoredReading
 from service.runtime.runtime import Runtime
@@ -220,7 +220,7 @@ def test_the_description_is_built_once_for_concurrent_callers(monkeypatch: pytes
         sleep(0.05)  # others ask while it is incomplete
         made["times finished"] = int(str(made.get("times finished", 0))) + 1
 
-    monkeypatch.setattr("service.api.description.share_problems", finish)
+    monkeypatch.setattr("service.api.app.share_problems", finish)
     app = DescribedApp(title="described")
     with ThreadPoolExecutor(8) as callers:
         seen = list(callers.map(lambda _: dict(app.openapi()), range(8)))

@@ -11,7 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.access.scopes import Scope
-from service.delivery.metrics.machine import Observed, machine_families
+from service.delivery.metrics import Observed, machine_families
 from service.history.records import StoreError
 from service.monitor.reports import Tally
 from service.runtime.runtime import Runtime, running

@@ -8,8 +8,7 @@ from typer.testing import CliRunner
 
 from models.errors import MachineFileError
 from service.commands.rotorwatch import app
-from service.delivery.webhooks.answer import Answer, Meaning, answer_of, pause_s
-from service.delivery.webhooks.receiver import Receiver
+from service.delivery.webhooks.receiver import Answer, Meaning, Receiver, answer_of, pause_s
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
 from service.runtime.runtime import Runtime
 from service.settings.service import load_settings

@@ -1,1 +1,0 @@
-"""Metrics of the monitor for Prometheus, read from snapshots when somebody asks."""
