@@ -68,39 +68,35 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     >>> knowledge_of(load_machine_file("lab")).level.value
     'full'
     """
-    rotor = machine.rotor
+    rotor, level = machine.rotor, KnowledgeLevel.NONE
     if not states_of(machine):
         lacks = "no channel is at bearing or disc, in y or z" if machine.holds_band else "snapshots are too short"
-        return Knowledge(KnowledgeLevel.NONE, f"{lacks}: vibration levels are learned, and nothing is diagnosed")
-    if isinstance(machine, Machine):
-        return Knowledge(KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor")
-    if rotor is None:
-        learned = ": everything is learned from the recordings"
+        text = f"{lacks}: vibration levels are learned, and nothing is diagnosed"
+    elif isinstance(machine, Machine):
+        level, text = KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor"
+    elif rotor is None:
+        text = "the machine file has no [rotor]: everything is learned from the recordings"
         if all(reason for _, reason in evaluable_rows(states_of(machine), has_phase_reference=True)):
-            learned = (
-                ", and these sensors allow no equation: no part is diagnosed, each channel is only compared with its "
-                "own healthy form"
+            text = (
+                "the machine file has no [rotor], and these sensors allow no equation: no part is diagnosed, each "
+                "channel is only compared with its own healthy form"
             )
-        return Knowledge(KnowledgeLevel.NONE, f"the machine file has no [rotor]{learned}")
-    lacking = [name for name in _GEOMETRY if name in rotor.unknown]
-    if lacking:
-        return Knowledge(
-            KnowledgeLevel.NONE,
+    elif lacking := [name for name in _GEOMETRY if name in rotor.unknown]:
+        text = (
             f"[rotor] lacks {', '.join(lacking)}: without masses and shaft it cannot be used at all, and "
-            "everything is learned from the recordings",
+            "everything is learned from the recordings"
         )
-    tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
-    if rotor.unknown:
-        return Knowledge(
-            KnowledgeLevel.PARTIAL,
-            f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: "
-            f"{', '.join(rotor.unknown)}",
+    elif rotor.unknown:
+        level, names = KnowledgeLevel.PARTIAL, ", ".join(rotor.unknown)
+        text = f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: {names}"
+    else:
+        tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
+        level = KnowledgeLevel.PARTIAL
+        text = (
+            f"[rotor] is complete, but without {' and '.join(tables)} nothing can be simulated: stiffness, damping and "
+            "unbalance are identified from the recordings"
         )
-    return Knowledge(
-        KnowledgeLevel.PARTIAL,
-        f"[rotor] is complete, but without {' and '.join(tables)} nothing can be simulated: stiffness, damping and "
-        "unbalance are identified from the recordings",
-    )
+    return Knowledge(level, text)
 
 
 _RPM = 30 / np.pi
@@ -169,8 +165,6 @@ def _rms(window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.float64
 FILE = "commissioned.json"
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition", "schedule"}
-
-
 Gyroscopic = Literal["Eq. 27", "opposite"]
 
 
