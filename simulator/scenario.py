@@ -170,12 +170,10 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             return
         if self.sensor_fault is None:
             raise ValueError(f"sensor {self.sensor!r} without sensor_fault")
-        if (self.sensor_fault in SENSOR_FAULTS_WITH_VALUE) != (self.value_SI is not None):
-            need = "needs" if self.sensor_fault in SENSOR_FAULTS_WITH_VALUE else "has no"
-            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} value_SI")
-        if (self.sensor_fault == "swapped") != (self.swapped_with is not None):
-            need = "needs" if self.sensor_fault == "swapped" else "has no"
-            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} swapped_with")
+        for field, kinds in (("value_SI", SENSOR_FAULTS_WITH_VALUE), ("swapped_with", ("swapped",))):
+            needed = self.sensor_fault in kinds
+            if needed != (getattr(self, field) is not None):
+                raise ValueError(f"sensor_fault {self.sensor_fault!r} {'needs' if needed else 'has no'} {field}")
         if self.swapped_with == self.sensor:
             raise ValueError(f"swapped_with is {self.swapped_with!r}, expected another channel than {self.sensor!r}")
         if self.sensor_fault == "delay" and not 0 <= (self.value_SI or 0.0) <= LONGEST_DELAY_S:
@@ -229,26 +227,21 @@ class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             Naming the scenario, the field, the unknown channel, and the channels the machine has; or two channels that
             cannot be swapped because they measure different quantities or in different units.
         """
-        known = [channel.name for channel in machine.sensors]
+        known = {channel.name: channel for channel in machine.sensors}
         named = [(f"sensors.channels.{name}", name) for name in self.sensors.channels]
-        named += [(f"events.{n}.sensor", e.sensor) for n, e in enumerate(self.events) if e.sensor is not None]
-        named += [
-            (f"events.{n}.swapped_with", e.swapped_with)
-            for n, e in enumerate(self.events)
-            if e.swapped_with is not None
-        ]
+        for field in ("sensor", "swapped_with"):
+            of_events = [(number, getattr(event, field)) for number, event in enumerate(self.events)]
+            named += [(f"events.{number}.{field}", name) for number, name in of_events if name is not None]
         for field, name in named:
             if name not in known:
                 raise MachineFileError(
                     f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
                     f"({', '.join(known)}){did_you_mean(name, known)}"
                 )
-
-        of = {channel.name: channel for channel in machine.sensors}
         for number, event in enumerate(self.events):
             if event.sensor is None or event.swapped_with is None:
                 continue
-            one, other = of[event.sensor], of[event.swapped_with]
+            one, other = known[event.sensor], known[event.swapped_with]
             if (one.quantity, one.unit) != (other.quantity, other.unit):
                 raise MachineFileError(
                     f"scenario {self.name}: events.{number}.swapped_with: {other.name} is a {other.quantity} in "
@@ -265,13 +258,9 @@ class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
         MachineFileError
             If the result is not a valid scenario (an event after the new end, say).
         """
-        fields = self.model_dump(exclude={"events"})
-        fields["events"] = [event.model_dump() for event in (*self.events, *faults)]
-        if seed is not None:
-            fields["seed"] = seed
-        if duration_s is not None:
-            fields["duration_s"] = duration_s
-        return checked(Scenario, fields, self.name)
+        others = {"seed": seed, "duration_s": duration_s}
+        fields = self.model_dump() | {name: value for name, value in others.items() if value is not None}
+        return checked(Scenario, fields | {"events": [one.model_dump() for one in (*self.events, *faults)]}, self.name)
 
 
 def shipped_scenarios() -> tuple[str, ...]:
@@ -350,8 +339,7 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict[str, object]:
         base = _merged(_locate(base_name, path.parent), (*seen, path.resolve()))
     except MachineFileError as error:
         raise MachineFileError(f"{path}: extends: {error}") from error
-    base.pop("name", None)
-    base.pop("description", None)
+    base = {key: value for key, value in base.items() if key not in {"name", "description"}}
     for key, value in own.items():
         below = base.get(key)
         base[key] = {**below, **value} if isinstance(below, dict) and isinstance(value, dict) else value

@@ -1,13 +1,16 @@
-"""A scenario as a stream of sample blocks and truth records, and the messages they are sent or recorded as.
+"""A scenario as a stream of sample blocks and truth records, the messages they are sent as, and recording them.
 
 The same scenario and seed give bit-identical samples whatever the length of the blocks: samples are made in pieces on a
 grid of their own and only then cut into blocks. A piece ends at a change of the plant, but not at one of a sensor, so
 that a sensor's fault or setting never changes the motion of the machine.
 """
 
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import numpy as np
@@ -16,6 +19,7 @@ from pydantic import BaseModel, Field
 
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_arrow, encode_block
 from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_moments
 from simulator.scenario import NamedSource, Scenario
@@ -224,3 +228,54 @@ class _Simulation:
 
     def time_ns(self, sample: int) -> int:
         return self._start_ns + round(sample * 1e9 / self._machine.rate_hz)
+
+
+def record(
+    machine: MachineFile,
+    stream: BlockStream,
+    path: Path,
+    *,
+    encoding: BlockEncoding = "raw",
+    overwrite: bool = False,
+    stop: Event | None = None,
+    on_block: Callable[[RunSummary], None] | None = None,
+) -> RunSummary:
+    """Record descriptor, truth and blocks under the keys a publisher would use.
+
+    All times in the file are data time: a block is logged at the time of the sample after its last one, when a real
+    machine could have sent it at the earliest. The file is ``.part`` until complete; when `stop` is set, it ends after
+    the current block and is complete.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be written.
+    """
+    keys, schema_hash = machine.keys, machine.descriptor.schema_hash
+    begin = time.monotonic()
+    summary = RunSummary()
+    first_ns: int | None = None
+    with RecordingWriter(path, overwrite=overwrite) as writer:
+        for block, truth in stream:
+            if first_ns is None:
+                first_ns = block.start_ns
+                descriptor = descriptor_payload(machine)
+                writer.write(
+                    RecordedMessage(keys.descriptor, descriptor, b"", JSON_ENCODING, block.start_ns, block.start_ns)
+                )
+            for entry in truth:
+                payload = entry.model_dump_json().encode()
+                writer.write(RecordedMessage(keys.truth, payload, b"", JSON_ENCODING, entry.time_ns, entry.time_ns))
+            payload, attachment, block_encoding = block_message(block, schema_hash, encoding)
+            writer.write(RecordedMessage(keys.stream, payload, attachment, block_encoding, block.end_ns, block.end_ns))
+            summary = RunSummary(
+                blocks=summary.blocks + 1,
+                data_s=(block.end_ns - first_ns) / 1e9,
+                elapsed_s=time.monotonic() - begin,
+                truth=truth[-1] if truth else summary.truth,
+            )
+            if on_block is not None:
+                on_block(summary)
+            if stop is not None and stop.is_set():
+                break
+    return summary

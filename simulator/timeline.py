@@ -93,12 +93,10 @@ def _conditions(
 
 def _condition(values: Mapping[_Target, _Values], scenario: Scenario) -> Condition:
     def current(source: NamedSource) -> NamedSource:
-        cutoff_hz, force_rms_N, direction = (
+        (cutoff_hz,), (force_rms_N,), direction = (
             values["source", source.name, field] for field in ("cutoff_hz", "force_rms_N", "direction")
         )
-        return source.model_copy(
-            update={"cutoff_hz": cutoff_hz[0], "force_rms_N": force_rms_N[0], "direction": direction}
-        )
+        return source.model_copy(update={"cutoff_hz": cutoff_hz, "force_rms_N": force_rms_N, "direction": direction})
 
     return Condition(
         relative_changes={name: values["parameter", name][0] for name in PARAMETERS},
