@@ -22,7 +22,6 @@ from models.signals.keys import Grant, access_control
 _HOST_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _LOCAL_PROTOCOLS = ("unixsock-stream", "unixpipe")
 _PORTLESS_PROTOCOLS = (*_LOCAL_PROTOCOLS, "serial", "vsock")
-_LOCAL = "127.0.0.1"
 _HIGHEST_PORT = 65535
 
 
@@ -76,19 +75,10 @@ def endpoint_fault(text: str) -> str | None:
         return f"{text!r}: expected a port, a number, after the host; did you mean {meant}?"
     known = [name for name in _HOST_PROTOCOLS if did_you_mean(protocol.rstrip(":"), [name])] or ["tcp"]
     place = re.fullmatch(rf"(?:[\w-]*:?/+)?(?:{host}:)?(\d+)", text)
-    meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or _LOCAL}:{place[2]}"
+    meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or '127.0.0.1'}:{place[2]}"
     if re.fullmatch(r"[A-Za-z][\w.-]*", text):
         meant = f"tcp/{text}:7447"
     return f"{text!r}: expected PROTOCOL/HOST:PORT; did you mean {meant}?"
-
-
-def _password_in(path: Path) -> str:
-    lines = _secret("password_file", path).splitlines()
-    if len(lines) != 1 or not lines[0].strip():
-        raise MachineFileError(
-            f"link.password_file: {path}: expected one line with the password, found {len(lines)} lines"
-        )
-    return lines[0].strip()
 
 
 def _user_names_in(path: Path) -> frozenset[str]:
@@ -289,7 +279,11 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         }
         if self.namespace:
             items["namespace"] = json.dumps(self.namespace)
-        return items | self._tls_items() | self._password_items() | self._access_items()
+        items |= self._tls_items() | self._password_items()
+        if self.grants:
+            rules = access_control(self.grants, "cert_common_names" if self.passwords_file is None else "usernames")
+            items["access_control"] = json.dumps(rules)
+        return items
 
     def explain(self, error: str) -> str:
         """Why a session could not be opened, in plain words.
@@ -306,9 +300,7 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         """Possible reasons why no endpoint accepted this program, in a sentence."""
         reasons = []
         if self.user is not None:
-            where = (
-                f"environment variable {self.password_variable}" if self.password_file is None else self.password_file
-            )
+            where = self.password_file or f"environment variable {self.password_variable}"
             reasons.append(f"the other side does not accept the user {self.user} with the password in {where}")
         else:
             reasons.append("the other side requires a user name, and link.user has none")
@@ -395,7 +387,11 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
 
     def _password(self) -> str:
         if self.password_file is not None:
-            return _password_in(self.password_file)
+            lines = _secret("password_file", self.password_file).splitlines()
+            if len(lines) != 1 or not lines[0].strip():
+                found = f"expected one line with the password, found {len(lines)} lines"
+                raise MachineFileError(f"link.password_file: {self.password_file}: {found}")
+            return lines[0].strip()
         password = os.environ.get(self.password_variable or "", "")
         if not password:
             raise MachineFileError(
@@ -403,13 +399,6 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
                 f"set, expected the password of user {self.user}"
             )
         return password
-
-    def _access_items(self) -> dict[str, str]:
-        if not self.grants:
-            return {}
-        known_by: Literal["usernames", "cert_common_names"]
-        known_by = "cert_common_names" if self.passwords_file is None else "usernames"
-        return {"access_control": json.dumps(access_control(self.grants, known_by))}
 
 
 class _LinkFile(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):

@@ -18,6 +18,7 @@ complete, or with `RecordingWriter.flush`; from then on its messages survive the
 
 import os
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -38,8 +39,6 @@ _CHUNK_BYTES = 256 * 1024
 _LENGTH = struct.Struct("<I")
 _RECORD_HEAD = 1 + 8  # bytes before a record's contents in the file: its kind and its length
 _PLAIN, _PREFIXED = "none", "attachment-1"
-_LIBRARY = "rotorwatch"
-_PROFILE = "rotorwatch-1"
 # What the mcap library lets through when a file is cut off or overwritten.
 DAMAGE = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, ValueError, KeyError, EOFError, MemoryError)
 
@@ -101,7 +100,7 @@ class RecordingWriter:
             self._file = self.part.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             try:
-                self._writer.start(profile=_PROFILE, library=_LIBRARY)
+                self._writer.start(profile="rotorwatch-1", library="rotorwatch")
                 self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
                 self._hand_over()
             except OSError:  # the disk is full: no empty file stays behind
@@ -116,10 +115,9 @@ class RecordingWriter:
 
     def write(self, message: RecordedMessage) -> None:
         """Append a message."""
-        framing = _PREFIXED if message.attachment else _PLAIN
-        data = message.payload
+        framing, data = _PLAIN, message.payload
         if message.attachment:
-            data = _LENGTH.pack(len(message.attachment)) + message.attachment + message.payload
+            framing, data = _PREFIXED, _LENGTH.pack(len(message.attachment)) + message.attachment + message.payload
         with writing(self.part):
             channel = self._channel(message.key, message.encoding, framing)
             sequence = self._counts[channel]
@@ -243,10 +241,9 @@ def summarize_recording(path: Path) -> RecordingSummary:
         summary = make_reader(file, validate_crcs=True).get_summary()
         if summary is None or summary.statistics is None:
             raise RecordingError(f"{path}: the recording has no index")
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for number, count in summary.statistics.channel_message_counts.items():
-            key = summary.channels[number].topic
-            counts[key] = counts.get(key, 0) + count
+            counts[summary.channels[number].topic] += count
         return RecordingSummary(summary.statistics.message_start_time, summary.statistics.message_end_time, counts)
 
 
