@@ -135,9 +135,8 @@ def band_limits(
         relative = ERRORS * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
         loudest = np.maximum(BEYOND_RANGE, 1 + relative * np.sqrt(shorter**2 - 1)) * high
         own[:, column], mean[:, column] = reference.mean, around
-        limit[:, column] = np.max(
-            [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around], axis=0
-        )
+        least = [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around]
+        limit[:, column] = np.max(least, axis=0)
     return BandLimits(own, mean, limit)
 
 

@@ -101,12 +101,8 @@ def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], plac
     """Change of 1x that a wrong gain of a place leaves unexplained: chi-square less its degrees of freedom, 0 at least.
 
     A gain changes 1x at its own place only, by its factor. A factor common to all places is an unbalance, and is not
-    counted. A changed bearing changes 1x at the other places too.
-
-    Parameters
-    ----------
-    logs, errors : ndarray, shape (n_channels,)
-        Logarithm of 1x over that of the healthy machine, and its standard error.
+    counted. A changed bearing changes 1x at the other places too. For each channel, `logs` has the logarithm of 1x over
+    that of the healthy machine, and `errors` its standard error.
     """
     names = tuple(dict.fromkeys(places))
     own = np.array([[one == name for one in places] for name in names]) / [[places.count(name)] for name in names]
@@ -129,9 +125,8 @@ def _edges(levels: BandLevels) -> FloatArray:
 
 def _thirds(rms: FloatArray) -> FloatArray:
     count = len(rms) // _PER_THIRD
-    return np.asarray(
-        np.sqrt((rms[: count * _PER_THIRD] ** 2).reshape(count, _PER_THIRD, -1).sum(axis=1)), dtype=np.float64
-    )
+    thirds = (rms[: count * _PER_THIRD] ** 2).reshape(count, _PER_THIRD, -1)
+    return np.asarray(np.sqrt(thirds.sum(axis=1)), dtype=np.float64)
 
 
 def _levels(levels: BandLevels, places: Sequence[str]) -> FloatArray:

@@ -250,9 +250,8 @@ class FirstWindows:
     @property
     def learning(self) -> bool:
         """Whether windows are still taken."""
-        return self.reference is None or (
-            self._turns and all(state.speed_rad_s is None for state in self.reference.states)
-        )
+        states = () if self.reference is None else self.reference.states
+        return not states or (self._turns and all(state.speed_rad_s is None for state in states))
 
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
         """Learn from a full window, if it is still needed and does not overlap the last one."""
@@ -281,7 +280,7 @@ class FirstWindows:
         seen = self._seen
         speeds = [math.nan if one.speed_rad_s is None else one.speed_rad_s for one in seen]
         shape = (len(seen), len(COMPARED), len(self._channels))
-        vectors = [np.zeros((0, 0)) if one.vectors is None else one.vectors for one in seen]
+        none = np.zeros((0, 0), dtype=np.complex128)
         return {
             "of": np.array([self._of]),
             "reference": np.array(["" if self.reference is None else self.reference.model_dump_json()]),
@@ -296,7 +295,7 @@ class FirstWindows:
                 if one.bands is not None
                 for name in ("edges_hz", "rms", "errors", "freedom")
             },
-            **{f"vectors_{number}": np.asarray(each, np.complex128) for number, each in enumerate(vectors)},
+            **{f"vectors_{number}": none if one.vectors is None else one.vectors for number, one in enumerate(seen)},
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -318,24 +317,22 @@ class FirstWindows:
         hops = checked(arrays, "hops", np.int64, (speeds.size,)).tolist()
         shape = (speeds.size, len(COMPARED), len(self._channels))
         values, errors = (checked(arrays, name, np.float64, shape) for name in ("values", "errors"))
-        vectors = [checked(arrays, f"vectors_{number}", np.complex128, (None, None)) for number in range(speeds.size)]
         flat, wide = (None,), (None, shape[2])
         forms = {"edges_hz": flat, "rms": wide, "errors": wide, "freedom": flat}
-        bands = [
-            BandLevels(**{name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in forms.items()})
-            if f"rms_{n}" in arrays
-            else None
-            for n in range(speeds.size)
-        ]
-        self._seen = [
-            WindowLevels(
-                dict(zip(COMPARED, values[number], strict=True)),
-                dict(zip(COMPARED, errors[number], strict=True)),
-                vectors[number] if vectors[number].size else None,
-                speed if math.isfinite(speed) else None,
-                hops[number],
-                bands[number],
+        seen = []
+        for n, speed in enumerate(speeds.tolist()):
+            vectors = checked(arrays, f"vectors_{n}", np.complex128, (None, None))
+            given = forms if f"rms_{n}" in arrays else {}
+            bands = {name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in given.items()}
+            seen.append(
+                WindowLevels(
+                    dict(zip(COMPARED, values[n], strict=True)),
+                    dict(zip(COMPARED, errors[n], strict=True)),
+                    vectors if vectors.size else None,
+                    speed if math.isfinite(speed) else None,
+                    hops[n],
+                    BandLevels(**bands) if bands else None,
+                )
             )
-            for number, speed in enumerate(speeds.tolist())
-        ]
-        self.reference, self._end_ns = reference, int(checked(arrays, "end_ns", np.int64, ()))
+        end_ns = int(checked(arrays, "end_ns", np.int64, ()))
+        self._seen, self.reference, self._end_ns = seen, reference, end_ns
