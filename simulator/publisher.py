@@ -142,12 +142,13 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
         query.reply(keys.descriptor, descriptor, encoding=JSON_ENCODING)
 
     outlets = _Outlets(outlet(keys.stream, _CACHE_BLOCKS), outlet(keys.descriptor, 1), outlet(keys.truth, _CACHE_TRUTH))
-    queryable = session.declare_queryable(keys.descriptor, answer)
-    token = session.liveliness().declare_token(keys.publisher_alive)
+    declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken]
+    declared = [*outlets, session.declare_queryable(keys.descriptor, answer)]
+    declared.append(session.liveliness().declare_token(keys.publisher_alive))
     try:
         yield outlets
     finally:
-        for item in (token, queryable, *reversed(outlets)):
+        for item in reversed(declared):
             item.undeclare()  # type: ignore[no-untyped-call]
 
 
