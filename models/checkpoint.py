@@ -129,15 +129,8 @@ def checked(
 
 
 def texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
-    """Return the texts in one array of any length.
-
-    Raises
-    ------
-    CheckpointError
-        As `checked`.
-    """
-    found: list[str] = checked(arrays, name, np.str_, (None,)).tolist()
-    return tuple(found)
+    """Return the texts in one array of any length, `checked`."""
+    return tuple(checked(arrays, name, np.str_, (None,)).tolist())
 
 
 def _digest(payload: bytes) -> bytes:

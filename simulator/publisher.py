@@ -197,13 +197,8 @@ def _send(
         elapsed_s = time.monotonic() - begin
         if elapsed_s >= look_s:
             look_s, heard = elapsed_s + _SUBSCRIBER_CHECK_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
-        summary = RunSummary(
-            blocks=summary.blocks + 1,
-            data_s=data_s,
-            elapsed_s=elapsed_s,
-            truth=truth[-1] if truth else summary.truth,
-            heard=heard,
-        )
+        latest = truth[-1] if truth else summary.truth
+        summary = RunSummary(summary.blocks + 1, data_s, elapsed_s, latest, heard)
         if on_block is not None:
             on_block(summary)
     return summary

@@ -140,13 +140,8 @@ def publish(
     from simulator.publisher import PublishSettings  # noqa: PLC0415  # keeps --help quick
     from simulator.publisher import publish as publish_stream  # noqa: PLC0415
 
-    settings = PublishSettings(
-        link=_link(link_file, mode, listen, connect),
-        pace=factor,
-        encoding=encoding,
-        wait_for_subscriber_s=wait_for_subscriber_s,
-        linger_s=linger_s,
-    )
+    link = _link(link_file, mode, listen, connect)
+    settings = PublishSettings(link, factor, encoding, wait_for_subscriber_s, linger_s)
     number = int(time.time()) % 65535 + 1 if run is None else run
     with _stop_on_signal() as stop, _progress(loaded.duration_s, rig.keys.stream) as on_block:
         stream = _stream(loaded, rig, block_s, start_ns, number)

@@ -161,13 +161,8 @@ class _Simulation:
         nonlinear = any(NONLINEAR & set(condition.anomalies) for _, condition in timeline.conditions)
         plant = NonlinearPlant if nonlinear else Plant
         self._plant = plant(machine, initial, np.random.default_rng(plant_seed))
-        self._sensors = SensorBank(
-            machine,
-            scenario.sensors,
-            theoretical_moments(machine, initial),
-            timeline.sensor_faults,
-            [np.random.default_rng(seed) for seed in sensor_seeds],
-        )
+        moments, rngs = theoretical_moments(machine, initial), [np.random.default_rng(seed) for seed in sensor_seeds]
+        self._sensors = SensorBank(machine, scenario.sensors, moments, timeline.sensor_faults, rngs)
         self._made = self._taken = 0
         self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
 
@@ -256,24 +251,19 @@ def record(
     summary = RunSummary()
     first_ns: int | None = None
     with RecordingWriter(path, overwrite=overwrite) as writer:
+
+        def write(key: str, time_ns: int, payload: bytes, attachment: bytes = b"", form: str = JSON_ENCODING) -> None:
+            writer.write(RecordedMessage(key, payload, attachment, form, time_ns, time_ns))
+
         for block, truth in stream:
             if first_ns is None:
                 first_ns = block.start_ns
-                descriptor = descriptor_payload(machine)
-                writer.write(
-                    RecordedMessage(keys.descriptor, descriptor, b"", JSON_ENCODING, block.start_ns, block.start_ns)
-                )
+                write(keys.descriptor, first_ns, descriptor_payload(machine))
             for entry in truth:
-                payload = entry.model_dump_json().encode()
-                writer.write(RecordedMessage(keys.truth, payload, b"", JSON_ENCODING, entry.time_ns, entry.time_ns))
-            payload, attachment, block_encoding = block_message(block, schema_hash, encoding)
-            writer.write(RecordedMessage(keys.stream, payload, attachment, block_encoding, block.end_ns, block.end_ns))
-            summary = RunSummary(
-                blocks=summary.blocks + 1,
-                data_s=(block.end_ns - first_ns) / 1e9,
-                elapsed_s=time.monotonic() - begin,
-                truth=truth[-1] if truth else summary.truth,
-            )
+                write(keys.truth, entry.time_ns, entry.model_dump_json().encode())
+            write(keys.stream, block.end_ns, *block_message(block, schema_hash, encoding))
+            data_s, latest = (block.end_ns - first_ns) / 1e9, truth[-1] if truth else summary.truth
+            summary = RunSummary(summary.blocks + 1, data_s, time.monotonic() - begin, latest)
             if on_block is not None:
                 on_block(summary)
             if stop is not None and stop.is_set():

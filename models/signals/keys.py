@@ -54,9 +54,8 @@ class MachineKeys:
     def __post_init__(self) -> None:
         for field, value in (("site", self.site), ("machine", self.machine)):
             if not _NAME.fullmatch(value):
-                raise MachineFileError(
-                    f"{field} name {value!r} cannot be part of a key: use 1 to 64 letters, digits, '_' or '-'"
-                )
+                why = "use 1 to 64 letters, digits, '_' or '-'"
+                raise MachineFileError(f"{field} name {value!r} cannot be part of a key: {why}")
 
     @property
     def root(self) -> str:
@@ -154,9 +153,8 @@ def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert
 
 
 def _rules(grant: Grant) -> list[tuple[_Flow, tuple[str, ...], list[str]]]:
-    publishes, views, monitors = (
-        [f"{PREFIX}/{place}" for place in places] for places in (grant.publishes, grant.views, grant.monitors)
-    )
+    placed = (grant.publishes, grant.views, grant.monitors)
+    publishes, views, monitors = ([f"{PREFIX}/{place}" for place in places] for places in placed)
     rules: list[tuple[_Flow, tuple[str, ...], list[str]]] = []
     if publishes:
         rules += [

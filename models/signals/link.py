@@ -88,9 +88,8 @@ def _user_names_in(path: Path) -> frozenset[str]:
         name, colon, password = line.partition(":")
         if not (name and colon and password) or line != line.strip() or " " in name:
             # Never the line itself: there is a password in it.
-            raise MachineFileError(
-                f"{place}: line {number}: expected name:password, without spaces around them, comments or empty lines"
-            )
+            form = "name:password, without spaces around them, comments or empty lines"
+            raise MachineFileError(f"{place}: line {number}: expected {form}")
         if name in names:
             raise MachineFileError(f"{place}: line {number}: the user {name} already has a line")
         names.append(name)
@@ -108,9 +107,8 @@ def _check_key(certificate: Path, key: Path) -> None:
     """Check that a file holds a private key that others may not read, and that it belongs to the certificate."""
     text = _secret("tls.key", key)
     if "ENCRYPTED" in text:
-        raise MachineFileError(
-            f"link.tls.key: {key}: the private key needs a passphrase, which cannot be entered here; expected none"
-        )
+        why = "the private key needs a passphrase, which cannot be entered here; expected none"
+        raise MachineFileError(f"link.tls.key: {key}: {why}")
     if "PRIVATE KEY-----" not in text:
         raise MachineFileError(f"link.tls.key: {key}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
     try:
@@ -125,10 +123,8 @@ def _secret(field: str, path: Path) -> str:
     except OSError as error:
         raise MachineFileError(f"link.{field}: {path}: cannot be read ({error.strerror})") from error
     if os.name == "posix" and mode & stat.S_IRWXO:
-        raise MachineFileError(
-            f"link.{field}: {path}: every user of this computer may read or change it (mode {mode:04o}); "
-            f"protect it with: chmod 600 {path}"
-        )
+        open_to = f"every user of this computer may read or change it (mode {mode:04o})"
+        raise MachineFileError(f"link.{field}: {path}: {open_to}; protect it with: chmod 600 {path}")
     return _text(field, path)
 
 
@@ -223,10 +219,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     def _no_secrets(cls, fields: Any) -> Any:  # whatever the file has; checked field by field afterwards
         for name in _SECRETS.keys() & fields.keys() if isinstance(fields, dict) else ():
             # Raised here, so that the value is in no message.
-            raise ValueError(
-                f"{name} does not belong in settings, which many may read: put it into a file of mode 600 and name "
-                f"that in {_SECRETS[name]}"
-            )
+            instead = f"put it into a file of mode 600 and name that in {_SECRETS[name]}"
+            raise ValueError(f"{name} does not belong in settings, which many may read: {instead}")
         return fields
 
     @model_validator(mode="after")
@@ -305,10 +299,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         else:
             reasons.append("the other side requires a user name, and link.user has none")
         if self._encrypted(self.connect) and self.tls is not None:
-            reasons.append(
-                f"the other side's certificate was not issued by {self.tls.root_certificate}, has expired, or is for "
-                "another name than the endpoint's"
-            )
+            invalid = f"was not issued by {self.tls.root_certificate}, has expired"
+            reasons.append(f"the other side's certificate {invalid}, or is for another name than the endpoint's")
             if self.tls.mutual:
                 reasons.append(f"{self.tls.certificate} was not issued by the authority trusted there, or has expired")
             else:
@@ -394,10 +386,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             return lines[0].strip()
         password = os.environ.get(self.password_variable or "", "")
         if not password:
-            raise MachineFileError(
-                f"link.password_variable: the environment variable {self.password_variable} is empty or not "
-                f"set, expected the password of user {self.user}"
-            )
+            empty = f"the environment variable {self.password_variable} is empty or not set"
+            raise MachineFileError(f"link.password_variable: {empty}, expected the password of user {self.user}")
         return password
 
 

@@ -260,9 +260,8 @@ def unpacked(channel: Channel, message: Message) -> RecordedMessage:
         attachment, payload = message.data[_LENGTH.size : end], message.data[end:]
     elif framing != _PLAIN:
         raise ValueError(f"framing {framing!r} on {channel.topic} is not {_PLAIN!r} or {_PREFIXED!r}")
-    return RecordedMessage(
-        channel.topic, bytes(payload), bytes(attachment), encoding, message.log_time, message.publish_time
-    )
+    times_ns = message.log_time, message.publish_time
+    return RecordedMessage(channel.topic, bytes(payload), bytes(attachment), encoding, *times_ns)
 
 
 @contextmanager

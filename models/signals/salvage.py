@@ -76,13 +76,7 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
 
 
 def inspect_recording(path: Path) -> Salvage:
-    """Read a recording from end to end and say what can be read of it.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be opened.
-    """
+    """Read a recording from end to end and say what can be read of it; `RecordingError` if it cannot be opened."""
     salvage = _nothing_yet(path)
     for _ in _salvaged(path, salvage):
         pass
@@ -92,10 +86,7 @@ def inspect_recording(path: Path) -> Salvage:
 def salvaged_messages(path: Path) -> Iterator[RecordedMessage]:
     """Messages that can be read of a recording, cut off or not, in the order in which they were written.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be opened.
+    Raises `RecordingError` if it cannot be opened.
     """
     return _salvaged(path, _nothing_yet(path))
 

@@ -233,9 +233,8 @@ def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
     expected = n_samples * n_channels * _DTYPES[code].itemsize
     _check_shape(n_samples, n_channels)
     if len(payload) != expected:
-        raise WireError(
-            f"payload has {len(payload)} bytes, expected {expected} for {n_samples} samples × {n_channels} channels"
-        )
+        shape = f"{n_samples} samples × {n_channels} channels"
+        raise WireError(f"payload has {len(payload)} bytes, expected {expected} for {shape}")
     samples: npt.NDArray[Any] = np.frombuffer(payload, dtype=_DTYPES[code]).reshape(n_samples, n_channels)
     return _checked(start_ns, sequence, run, rate_hz, samples)
 

@@ -90,9 +90,8 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     machine, condition = draw.machine, draw.machine.condition
     condition_number = 0 if draw.fixed_condition else number
     rng = generator(draw, condition_number)
-    changes = {
-        name: float(rng.uniform(-draw.spread, draw.spread)) for name in PARAMETERS if name not in draw.kept_nominal
-    } | draw.faults
+    varied = [name for name in PARAMETERS if name not in draw.kept_nominal]
+    changes = {name: float(rng.uniform(-draw.spread, draw.spread)) for name in varied} | draw.faults
     tolerance = machine.operation.speed_tolerance
     speed_rpm = machine.operation.speed_rpm * float(rng.uniform(1 - tolerance, 1 + tolerance))
     cutoff_hz = float(rng.uniform(*condition.cutoff_hz))
