@@ -303,8 +303,8 @@ def _locate(name_or_path: str | Path, folder: Path) -> Path:
     path = folder / name_or_path
     if not path.is_file():
         known = [*shipped_scenarios(), *(entry.name for entry in path.parent.glob("*.toml"))]
-        shipped, hint = ", ".join(shipped_scenarios()), did_you_mean(path.name, known)
-        raise MachineFileError(f"{path}: no such scenario file; shipped scenarios: {shipped}{hint}")
+        names, hint = ", ".join(shipped_scenarios()), did_you_mean(path.name, known)
+        raise MachineFileError(f"{path}: no such scenario file; shipped scenarios: {names}{hint}")
     return path
 
 
