@@ -144,9 +144,9 @@ def _calibrate_for(
     bundle = save_bundle(out, machine, tuple(calibrated), made.model_copy(update=numbers), amortised)
     title = f"bundle {bundle.identity}"
     table = Table("equation", "parameter", "healthy spread per window", "residual (MSD)", title=title)
-    for equation, healthy in ((one.equation, one.healthy) for one in calibrated if one.healthy is not None):
-        for parameter, spread in zip(equation.parameters, healthy.spread, strict=True):
-            table.add_row(f"({equation.number}) {equation.title}", parameter, f"{spread:.2%}", f"{healthy.msd:.2g}")
+    for equation, found in ((one.equation, one.healthy) for one in calibrated if one.healthy is not None):
+        for parameter, spread in zip(equation.parameters, found.spread, strict=True):
+            table.add_row(f"({equation.number}) {equation.title}", parameter, f"{spread:.2%}", f"{found.msd:.2g}")
     Console().print(table)
     typer.echo(f"written to {out}")
 
