@@ -124,16 +124,9 @@ def parameter_summaries(
 ) -> tuple[ParameterSummary, ...]:
     """Summarise the readings of each parameter in healthy windows.
 
-    Parameters
-    ----------
-    diagnoses : sequence of (recording, end_ns, Diagnosis)
-        Healthy windows read as later ones will be, with the shared error in each.
-    compared : sequence of (recording, end_ns, Diagnosis)
-        The same windows read against what was learned without them.
-    healthy_s, window_s : float
-        Length of the data learned from, and of the windows in `diagnoses`.
-    identified : mapping of str to float
-        Identified values, SI.
+    `diagnoses` are (recording, end_ns, diagnosis) of windows read as later ones will be, with the shared error in each;
+    `compared` are the same windows read against what was learned without them. `healthy_s` of data were learned from,
+    and the windows in `diagnoses` have `window_s`; identified values are SI.
     """
     settings = SequentialSettings.for_machine(machine)
     threshold = settings.thresholds(settings.window_hops).first + float(ndtri(_POWER))
@@ -142,12 +135,8 @@ def parameter_summaries(
         errors = [_errors(name, diagnosis) for _, _, diagnosis in diagnoses]
         known = [each for each in errors if each is not None]
         if not known:
-            reasons = dict.fromkeys(
-                reading.reason
-                for _, _, diagnosis in diagnoses
-                for reading in diagnosis.parameters
-                if reading.name == name and reading.reason
-            )
+            every = [each for _, _, diagnosis in diagnoses for each in diagnosis.parameters if each.name == name]
+            reasons = dict.fromkeys(each.reason for each in every if each.reason)
             reason = "; ".join(reasons) or "cannot be told without the rotor's own parameters"
             found.append(ParameterSummary(name=name, text=PARAMETER_TEXT[name], evaluable=False, reason=reason))
             continue
@@ -240,14 +229,9 @@ def commission(
     why: str = "",
     progress: Progress = lambda *_: None,
 ) -> Commissioning:
-    """Commission a machine.
+    """Commission a machine from recordings of one steady condition each.
 
-    Parameters
-    ----------
-    recordings : sequence of HealthyRecording
-        One for each file, each of one steady condition.
-    wished : float, optional
-        Relative change that is to be found; by default the alarm limit.
+    `wished` is the relative change that is to be found, by default the alarm limit.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
@@ -256,9 +240,7 @@ def commission(
         checks, pieces = [*checks, unsuited], []
     learned, states = Learned(()), states_of(machine)
     if pieces:
-        by_recording = {
-            one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
-        }
+        by_recording = {one.name: [each.window for each in pieces if each.recording == one.name] for one in recordings}
         findings = {
             name: [
                 fault
@@ -314,9 +296,8 @@ def commission(
                 known_lines(recordings),
             ),
         )
-    return Commissioning(
-        _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine
-    )
+    report = _report(machine, recordings, checks, learned, commissioned, pieces, wished)
+    return Commissioning(report, commissioned, learned.machine)
 
 
 def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple[KnownLine, ...]:

@@ -82,10 +82,8 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
                 "channel is only compared with its own healthy form"
             )
     elif lacking := [name for name in _GEOMETRY if name in rotor.unknown]:
-        text = (
-            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft it cannot be used at all, and "
-            "everything is learned from the recordings"
-        )
+        without = "without masses and shaft it cannot be used at all"
+        text = f"[rotor] lacks {', '.join(lacking)}: {without}, and everything is learned from the recordings"
     elif rotor.unknown:
         level, names = KnowledgeLevel.PARTIAL, ", ".join(rotor.unknown)
         text = f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: {names}"
@@ -129,13 +127,9 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
         """Range of healthy windows."""
         speeds = [window.speed_rad_s * _RPM for window in windows if np.isfinite(window.speed_rad_s)]
         rms = np.array([_rms(window) for window in windows])
-        return cls(
-            speed_rpm=(min(speeds), max(speeds)) if speeds else None,
-            rms={
-                name: (float(low), float(high))
-                for name, low, high in zip(windows[0].states, rms.min(axis=0), rms.max(axis=0), strict=True)
-            },
-        )
+        ranges = zip(rms.min(axis=0).tolist(), rms.max(axis=0).tolist(), strict=True)
+        of_states = dict(zip(windows[0].states, ranges, strict=True))
+        return cls(speed_rpm=(min(speeds), max(speeds)) if speeds else None, rms=of_states)
 
     def outside(self, window: WindowStatistics, naming: Naming) -> str:
         """Why a window is outside the commissioned conditions; empty if it is inside."""
@@ -151,10 +145,8 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             low, high = self.rms[name]
             if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
                 found, least, most = (naming.value(name, each) for each in (value, low, high))
-                return (
-                    f"random vibration of {naming.name(name)} is {found} rms, commissioned at {least} to {most}, and "
-                    f"up to {LEVEL_MARGIN:g} times less or more"
-                )
+                seen = f"{least} to {most}, and up to {LEVEL_MARGIN:g} times less or more"
+                return f"random vibration of {naming.name(name)} is {found} rms, commissioned at {seen}"
         return ""
 
 
@@ -288,10 +280,7 @@ def described(machine: MachineFile) -> dict[str, Any]:
 def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:
     """Load a commissioned bundle and check that it belongs to a machine.
 
-    Parameters
-    ----------
-    same_description : bool
-        Whether channels, window and physics must be the same as when it was commissioned.
+    With `same_description`, channels, window and physics must be the same as when it was commissioned.
 
     Raises
     ------
@@ -367,10 +356,7 @@ class Installed:
 def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     """Load what a machine is monitored with; if it is neither known nor commissioned, only its levels are watched.
 
-    Parameters
-    ----------
-    bundle : str or Path, optional
-        Shipped bundle by name, or directory of a trained or commissioned one.
+    The bundle is a shipped one by its name, or the directory of a trained or commissioned one.
 
     Raises
     ------

@@ -92,16 +92,14 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
     for recording in recordings:
         plan = recording.plan
         for stretch in recording.stretches:
-            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
             if len(stretch) < _SHORTEST_HOPS:
                 continue
+            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
             cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
             parts = [stretch[a:b] for a, b in pairwise(cuts.tolist())]
-            windows = [window_statistics(plan, part, lines=None) for part in parts]
-            found += [
-                HealthyPiece(recording.name, 2 * number >= count, window, levels_of(plan, part))
-                for number, (window, part) in enumerate(zip(windows, parts, strict=True))
-            ]
+            for number, part in enumerate(parts):
+                window, levels = window_statistics(plan, part, lines=None), levels_of(plan, part)
+                found.append(HealthyPiece(recording.name, 2 * number >= count, window, levels))
     return found
 
 
@@ -129,18 +127,14 @@ def _learn_by_theory(
         if has_angle(windows):
             raise
         found = read_by(sized=False)
-    stated = [
-        determined(diagnosis, window, machine.window_data_s)
-        for window, diagnosis in zip(windows, found.diagnoses, strict=True)
-    ]
+    pairs = zip(windows, found.diagnoses, strict=True)
+    stated = [determined(diagnosis, window, machine.window_data_s) for window, diagnosis in pairs]
     record = None
     if found.names:
         stated = [with_shared_error(each, found.covariance) for each in stated]
-        record = IdentifiedRecord(
-            machine=found.machine.model_dump(mode="json", include={"rotor", "operation", "condition"}),
-            names=found.names,
-            covariance=tuple(tuple(row) for row in found.covariance.tolist()),
-        )
+        tables = found.machine.model_dump(mode="json", include={"rotor", "operation", "condition"})
+        covariance = tuple(map(tuple, found.covariance.tolist()))
+        record = IdentifiedRecord(machine=tables, names=found.names, covariance=covariance)
     check = check_agreement(machine, stated, what)
     if check.verdict == "refused":
         advice = f"{check.advice}; {NO_SUCH_ROTOR}"
@@ -191,10 +185,8 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         advice = f"sample at {math.ceil(1 / longest_s)} Hz or faster"
     elif all(reason for _, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))):
         why = "these sensors allow no equation"
-        advice = (
-            "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in "
-            "that plane"
-        )
+        sensors = "a displacement, velocity or acceleration at the bearing and at the disc in that plane"
+        advice = f"for the bearing in one plane: {sensors}"
     if why:
         if shape is None:
             check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
@@ -238,32 +230,21 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
         compared += _read_across_halves(group, baseline.rows)
     halves = check_agreement(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
-    sources = check_sources(
-        {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
-    )
+    names = dict.fromkeys(piece.recording for piece in pieces)
+    sources = check_sources({name: [each.window for each in pieces if each.recording == name] for name in names})
     band = _differentiated(baselines[0], machine)
     checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
-    return Learned(
-        checks,
-        tuple(read),
-        tuple(compared),
-        notes=(band, _LINEAR),
-        baselines=tuple(
-            ConditionBaseline(
-                conditions=OperatingRange.of([piece.window for piece in group]), baseline=BaselineRecord.of(baseline)
-            )
-            for group, baseline in zip(groups, baselines, strict=True)
-        ),
-    )
+    records = []
+    for group, baseline in zip(groups, baselines, strict=True):
+        conditions = OperatingRange.of([piece.window for piece in group])
+        records.append(ConditionBaseline(conditions=conditions, baseline=BaselineRecord.of(baseline)))
+    return Learned(checks, tuple(read), tuple(compared), baselines=tuple(records), notes=(band, _LINEAR))
 
 
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
     """Learn a baseline from healthy windows that do not overlap, without relations that they hardly determine.
 
-    Parameters
-    ----------
-    conditions : sequence of str
-        Condition of each window, for example its recording.
+    Each window has a condition, for example its recording.
 
     Raises
     ------
@@ -286,11 +267,9 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
 
 def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
     """Sentence on the frequency up to which derivatives of the measured motions are valid."""
-    deepest = max(
-        formation_of([term.motions for term in row.terms], relation.states).deepest
-        for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
-        if relation is not None
-    )
+    pairs = zip(learned_rows(baseline.rows), baseline.relations, strict=True)
+    known = [(row.terms, relation.states) for row, relation in pairs if relation is not None]
+    deepest = max(formation_of([term.motions for term in terms], states).deepest for terms, states in known)
     edge = passband_hz(deepest, machine.window.band_hz[1], machine.time_scale)
     return (
         f"What is not measured is derived: up to {deepest} derivatives are taken of the correlation functions under "

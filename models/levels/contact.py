@@ -137,13 +137,7 @@ class LatestContact:
         return {"contact": hops, "contact_state": np.array(self._state, dtype=np.int64)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Go on where `checkpoint` was called; `CheckpointError` if an array is missing or of another form."""
         hops = checked(arrays, "contact", np.float32, (None, None))
         self._state = int(checked(arrays, "contact_state", np.int64, ()))
         self._hops = deque(hops, self._hops.maxlen)

@@ -63,13 +63,10 @@ def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]
     every = [np.array([_levels(one, places)[counts] for one in recording]) for recording in recordings]
     within = np.concatenate([_contrast(own - own.mean(axis=0)) for own in every])
     scatter = np.sqrt((within**2).sum(axis=0) / freedom)
-    return GainReference(
-        places=names,
-        edges_hz=tuple(_edges(windows[0])[counts].tolist()),
-        levels=tuple(tuple(map(tuple, own.mean(axis=0).round(4).tolist())) for own in every),
-        scatter=tuple(map(tuple, scatter.round(5).tolist())),
-        windows=min(map(len, every)),
-    )
+    levels = tuple(tuple(map(tuple, own.mean(axis=0).round(4).tolist())) for own in every)
+    edges_hz, spread = tuple(_edges(windows[0])[counts].tolist()), tuple(map(tuple, scatter.round(5).tolist()))
+    fewest = min(map(len, every))
+    return GainReference(places=names, edges_hz=edges_hz, levels=levels, scatter=spread, windows=fewest)
 
 
 def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReference) -> tuple[str, float] | None:

@@ -62,14 +62,9 @@ def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
-    means = [window.mean() for window in windows]
-    mean = float(values.mean())
-    return HopReference(
-        mean=mean,
-        scatter=float(values.std(ddof=1)),
-        hops=values.size,
-        range=float(np.max(np.abs(np.array(means) - mean))),
-    )
+    mean, scatter = float(values.mean()), float(values.std(ddof=1))
+    farthest = max(abs(float(window.mean()) - mean) for window in windows)
+    return HopReference(mean=mean, scatter=scatter, hops=values.size, range=farthest)
 
 
 GAUSSIAN = 3.0

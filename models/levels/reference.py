@@ -130,19 +130,13 @@ def expected_levels(
     bands, parts, nothing = {}, {}, HopReference(mean=0.0, scatter=1.0, hops=_BY_THEORY, range=_OF_MEANS)
     if levels.bands is not None and levels.lines is not None:
         edges_hz, none = tuple(levels.bands.edges_hz.tolist()), (0.0,) * len(levels.bands.freedom)
-        silent = BandReference(
-            edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=tuple(levels.bands.freedom.tolist())
-        )
+        freedom = tuple(levels.bands.freedom.tolist())
+        silent = BandReference(edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=freedom)
         found = tuple(expected_lines(levels.bands, levels.hops, modes).round(3).tolist())
         bands, parts = dict.fromkeys(channels, silent), dict.fromkeys(channels, found)
+    contact = {} if levels.contact is None else dict.fromkeys(channels, nothing)
     state = OperatingState(
-        windows=1,
-        speed_rad_s=speeds_rad_s,
-        levels={},
-        hops=levels.hops,
-        bands=bands,
-        lines=parts,
-        contact={} if levels.contact is None else dict.fromkeys(channels, nothing),
+        windows=1, speed_rad_s=speeds_rad_s, levels={}, hops=levels.hops, bands=bands, lines=parts, contact=contact
     )
     return LevelReference(source="the machine file", states=(state,))
 
@@ -203,16 +197,11 @@ def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> Refere
     vector, turned = None, 0.0
     if name == "x1" and all(one.vectors is not None for one in levels):
         of_windows = np.array([one.vectors[1, column] for one in levels if one.vectors is not None])
-        mean = complex(of_windows.mean())
-        vector, turned = (mean.real, mean.imag), float(np.abs(of_windows - mean).max())
-    return ReferenceLevel(
-        mean=float(values.mean()),
-        low=float(values.min()),
-        high=float(values.max()),
-        error=float(np.nanmean(errors)) if np.any(np.isfinite(errors)) else 0.0,
-        vector=vector,
-        turned=turned,
-    )
+        centre = complex(of_windows.mean())
+        vector, turned = (centre.real, centre.imag), float(np.abs(of_windows - centre).max())
+    mean, low, high = float(values.mean()), float(values.min()), float(values.max())
+    error = float(np.nanmean(errors)) if np.any(np.isfinite(errors)) else 0.0
+    return ReferenceLevel(mean=mean, low=low, high=high, error=error, vector=vector, turned=turned)
 
 
 class FirstWindows:
@@ -221,18 +210,11 @@ class FirstWindows:
     A channel whose values are NaN in some of them is learned from the others.
 
     If the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood
-    still: the first windows in which it turns become a second reference.
+    still: the first windows in which it turns become a second reference. It `turns` if rotation can be detected, by a
+    shaft angle or near a nominal speed.
 
-    Parameters
-    ----------
-    count : int
-        Number of windows, which do not overlap.
-    turns : bool
-        Whether rotation can be detected: by a shaft angle, or near a nominal speed.
-    since : str
-        Since when they count, as operators will read it; empty if from the beginning.
-    of : str
-        Identifies what the levels depend on: a reference of another machine, or other settings, is not restored.
+    Windows do not overlap. Operators read `since` when they count, empty if from the beginning. `of` identifies what
+    the levels depend on: a reference of another machine, or other settings, is not restored.
     """
 
     def __init__(
