@@ -27,9 +27,8 @@ from ray.cluster_utils import Cluster
 
 from models.machine import load_machine
 from service.runtime.archive import MachineTask, on_cluster
-from simulator.recorder import record
 from simulator.scenario import load_scenario
-from simulator.stream import blocks
+from simulator.stream import blocks, record
 
 EVER_NS = 2**63 - 1
 

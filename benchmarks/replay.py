@@ -15,9 +15,8 @@ from pathlib import Path
 from machine_kind import rotor_kit
 
 from models.machine import load_machine
-from simulator.recorder import record
 from simulator.scenario import load_scenario
-from simulator.stream import blocks
+from simulator.stream import blocks, record
 
 
 def main() -> None:

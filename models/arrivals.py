@@ -45,12 +45,8 @@ class Arrivals:
     """Puts the blocks of one machine in the order of their sequence, run by run.
 
     A run begins at sequence 0: if its first blocks are overtaken, the others wait for them. If the stream has run for
-    longer, it begins with the first block that arrives.
-
-    Parameters
-    ----------
-    bound : int
-        How many blocks may wait for a missing one; 0 hands on everything as it comes.
+    longer, it begins with the first block that arrives. At most `bound` blocks wait for a missing one; 0 hands on
+    everything as it comes.
 
     Raises
     ------
@@ -73,8 +69,7 @@ class Arrivals:
         self._run: int | None = None
         self._next = 0
         self._waiting: dict[int, list[Arrived]] = {}
-        self._course: Course | None = None
-        self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
+        self._courses: deque[Course] = deque(maxlen=EARLIER_COURSES + 1)  # of what has gone on, the present one last
 
     @property
     def waiting(self) -> int:
@@ -82,21 +77,13 @@ class Arrivals:
         return len(self._waiting)
 
     def take(self, block: SampleBlock, schema_hash: str = "") -> tuple[Arrived, ...]:
-        """Take a block as it arrives.
+        """Take a block as it arrives, and return those that may go to the gate now, in order.
 
-        Parameters
-        ----------
-        schema_hash : str
-            Schema hash the sender named, empty if it named none.
-
-        Returns
-        -------
-        tuple of Arrived
-            Blocks that may go to the gate now, in order. Repetitions of blocks that have gone on do so at once and
-            change nothing here; those of waiting blocks follow their originals.
+        Repetitions of blocks that have gone on do so at once and change nothing here; those of waiting blocks follow
+        their originals.
         """
         arrived = Arrived(block, schema_hash)
-        if self._bound == 0 or self._is_repetition(block):
+        if self._bound == 0 or any(course.covers(block) for course in self._courses):
             return (arrived,)
         if block.run == self._run and block.sequence >= self._next:
             if block.sequence > self._next or self._waiting:
@@ -105,8 +92,9 @@ class Arrivals:
             self._next += 1
             return (arrived,)
         # Another run, or a count that began anew: the missing blocks of the old one are given up.
-        gone_on = self.flush()
-        known = 0 if block.run == self._run else self._next_sequence(block.run)
+        gone_on, known = self.flush(), 0
+        if block.run != self._run:
+            known = max((course.sequence for course in self._courses if course.run == block.run), default=0)
         self._run = block.run
         self._next = known if known <= block.sequence <= known + self._bound else block.sequence
         return gone_on + self._place(arrived)
@@ -126,22 +114,8 @@ class Arrivals:
     def resume(self, courses: Iterable[Course]) -> None:
         """Continue after the courses of a restored gate, of which the present one is the last."""
         self._waiting.clear()
-        self._earlier.clear()
-        self._earlier.extend(courses)
-        self._course = self._earlier.pop() if self._earlier else None
-        self._run = None if self._course is None else self._course.run
-        self._next = 0 if self._course is None else self._course.sequence
-
-    def _is_repetition(self, block: SampleBlock) -> bool:
-        """Whether the block has gone on, or its place has been passed over."""
-        if self._course is not None and self._course.covers(block):
-            return True
-        return any(course.covers(block) for course in self._earlier)
-
-    def _next_sequence(self, run: int) -> int:
-        """Next sequence in a run that was left for another one; 0 if the run is new."""
-        courses = (*self._earlier, *(() if self._course is None else (self._course,)))
-        return max((course.sequence for course in courses if course.run == run), default=0)
+        self._courses = deque((*courses,)[-EARLIER_COURSES:], self._courses.maxlen)
+        self._run, self._next = (self._courses[-1].run, self._courses[-1].sequence) if self._courses else (None, 0)
 
     def _place(self, arrived: Arrived) -> tuple[Arrived, ...]:
         """Put a block of the present run in its place, and hand on what is complete."""
@@ -168,14 +142,11 @@ class Arrivals:
 
     def _note(self, block: SampleBlock) -> None:
         """Remember a block that goes on, so that its repetitions are known."""
-        course = self._course
-        if course is None:
-            self._course = Course.beginning(block)
-        elif block.run == course.run and block.sequence >= course.sequence and block.end_ns > course.start_ns:
-            self._course = course.extended(block)
+        now = self._courses[-1] if self._courses else None
+        if now and block.run == now.run and block.sequence >= now.sequence and block.end_ns > now.start_ns:
+            self._courses[-1] = now.extended(block)
         else:
-            self._earlier.append(course)
-            self._course = Course.beginning(block)
+            self._courses.append(Course.beginning(block))
 
 
 def _same(one: Arrived, other: Arrived) -> bool:
@@ -233,13 +204,7 @@ class Senders:
         self._disputed: dict[tuple[int, int], float] = {}
 
     def take(self, block: SampleBlock) -> bool:
-        """Take note of a block that has arrived.
-
-        Returns
-        -------
-        bool
-            Whether the block has come in two versions: the same run, number and time, but other contents.
-        """
+        """Take note of a block, and say whether it came in two versions: equal run, number and time, other contents."""
         self._heard_s += block.samples.shape[0] / block.rate_hz
         self._follow(block)
         key = (block.run, block.sequence)

@@ -33,10 +33,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Put named arrays of numbers, truth values and text into bytes; the same arrays give the same bytes.
 
-    Parameters
-    ----------
-    arrays : mapping of str to ndarray
-        Of any shape; the order of elements in memory (rows or columns first) is kept.
+    They have any shape; the order of elements in memory (rows or columns first) is kept.
 
     Raises
     ------
@@ -112,12 +109,7 @@ def unprefixed(part: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndar
 def checked(
     arrays: Mapping[str, np.ndarray], name: str, kind: type[_Scalar], shape: tuple[int | None, ...]
 ) -> npt.NDArray[_Scalar]:
-    """Return one array if it is what it should be.
-
-    Parameters
-    ----------
-    shape : tuple of int or None
-        Expected shape; None where any size will do.
+    """Return one array if it is what it should be; the shape is None where any size will do.
 
     Raises
     ------
@@ -127,27 +119,18 @@ def checked(
     array = arrays.get(name)
     if array is None:
         raise CheckpointError(f"{name} is missing; there are {', '.join(sorted(arrays)) or 'no arrays at all'}")
-    fits = len(array.shape) == len(shape) and all(
-        size in (None, found) for size, found in zip(shape, array.shape, strict=True)
-    )
+    sizes = zip(shape, array.shape, strict=True)
+    fits = len(array.shape) == len(shape) and all(size in (None, found) for size, found in sizes)
     if not fits or array.dtype.type is not kind:
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise CheckpointError(
-            f"{name} has type {array.dtype} and shape {array.shape}, expected {kind.__name__} and ({wanted})"
-        )
+        has = f"type {array.dtype} and shape {array.shape}"
+        raise CheckpointError(f"{name} has {has}, expected {kind.__name__} and ({wanted})")
     return array
 
 
 def texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
-    """Return the texts in one array of any length.
-
-    Raises
-    ------
-    CheckpointError
-        As `checked`.
-    """
-    found: list[str] = checked(arrays, name, np.str_, (None,)).tolist()
-    return tuple(found)
+    """Return the texts in one array of any length, `checked`."""
+    return tuple(checked(arrays, name, np.str_, (None,)).tolist())
 
 
 def _digest(payload: bytes) -> bytes:

@@ -116,11 +116,8 @@ class Course:
 class Gate:
     """Judges the blocks of one machine in the order of their arrival.
 
-    Parameters
-    ----------
-    partial : bool
-        Whether blocks are accepted in which some channels, but not all, have no finite number at all: their sensors
-        are not connected. Where single numbers are missing, samples have been lost, and the block is refused.
+    With `partial`, blocks are accepted in which some channels, but not all, have no finite number at all: their sensors
+    are not connected. Where single numbers are missing, samples have been lost, and the block is refused.
     """
 
     def __init__(self, machine: MachineFile, *, partial: bool = False) -> None:
@@ -128,8 +125,7 @@ class Gate:
         self._name = machine.title
         self._settings = machine.ingest
         self._rate_hz = machine.rate_hz
-        self._n_channels = len(machine.sensors)
-        self._names = tuple(channel.name for channel in machine.sensors)
+        self._channels = [channel.name for channel in machine.sensors]
         self._schema_hash = machine.descriptor.schema_hash
         self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
         self._tolerance_ns = round(machine.ingest.time_tolerance_s * 1e9)
@@ -174,7 +170,7 @@ class Gate:
 
         Takes microseconds and changes nothing: any thread may ask.
         """
-        if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
+        if not may_be_block(payload, attachment, encoding, len(self._channels), self._most_samples):
             return False
         if size_alone or encoding.startswith(ARROW_ENCODING):
             return True
@@ -185,13 +181,7 @@ class Gate:
         return self.form(block, schema_hash) is None
 
     def judge(self, block: SampleBlock, schema_hash: str | None = "") -> Admission:
-        """Accept or refuse a block.
-
-        Parameters
-        ----------
-        schema_hash : str or None
-            Schema hash the sender named, empty if it named none; None if the block's `form` has been found right.
-        """
+        """Accept or refuse a block; the schema hash is None if the block's `form` has been found right before."""
         return (None if schema_hash is None else self.form(block, schema_hash)) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -221,35 +211,24 @@ class Gate:
 
     def form(self, block: SampleBlock, schema_hash: str = "") -> Admission | None:  # noqa: PLR0911  # one return per reason
         """Refuse a block whose form is wrong, whatever its time."""
-        settings, n_samples = self._settings, block.samples.shape[0]
+        settings, channels, which = self._settings, self._channels, f"block {block.sequence}"
+        n_samples, n_channels = block.samples.shape
         if schema_hash and schema_hash != self._schema_hash:
-            return self._refuse(
-                Reason.CHANNELS,
-                f"the stream's channel descriptor has hash {schema_hash}, expected {self._schema_hash} for channels "
-                f"{', '.join(self._names)}",
-            )
-        if block.samples.shape[1] != self._n_channels:
-            return self._refuse(
-                Reason.CHANNELS,
-                f"block {block.sequence} has {block.samples.shape[1]} channels, expected {self._n_channels} "
-                f"({', '.join(self._names)})",
-            )
+            hashes = f"hash {schema_hash}, expected {self._schema_hash}"
+            text = f"the stream's channel descriptor has {hashes} for channels {', '.join(channels)}"
+            return self._refuse(Reason.CHANNELS, text)
+        if n_channels != len(channels):
+            text = f"{which} has {n_channels} channels, expected {len(channels)} ({', '.join(channels)})"
+            return self._refuse(Reason.CHANNELS, text)
         if abs(block.rate_hz / self._rate_hz - 1) > settings.rate_tolerance:
-            return self._refuse(
-                Reason.RATE, f"block {block.sequence} has rate_hz {block.rate_hz:g}, expected {self._rate_hz:g}"
-            )
+            return self._refuse(Reason.RATE, f"{which} has rate_hz {block.rate_hz:g}, expected {self._rate_hz:g}")
         if not 0 <= block.start_ns < _LATEST_NS:
-            return self._refuse(
-                Reason.MALFORMED,
-                f"start_ns of block {block.sequence} is {block.start_ns}, expected a time from 1970 to 2199",
-            )
+            text = f"start_ns of {which} is {block.start_ns}, expected a time from 1970 to 2199"
+            return self._refuse(Reason.MALFORMED, text)
         length_s = n_samples / self._rate_hz
         if not settings.block_from_s <= length_s <= settings.block_to_s:
-            return self._refuse(
-                Reason.SHAPE,
-                f"block {block.sequence} has {n_samples} samples ({length_s:g} s), expected {settings.block_from_s:g} "
-                f"to {settings.block_to_s:g} s",
-            )
+            expected = f"{settings.block_from_s:g} to {settings.block_to_s:g} s"
+            return self._refuse(Reason.SHAPE, f"{which} has {n_samples} samples ({length_s:g} s), expected {expected}")
         finite = np.isfinite(block.samples)
         if finite.all():
             return None
@@ -257,79 +236,49 @@ class Gate:
             finite |= ~finite.any(axis=0)
         if not finite.all():
             row, column = (int(where) for where in np.argwhere(~finite)[0])
-            return self._refuse(
-                Reason.NOT_FINITE,
-                f"block {block.sequence}, channel {self._names[column]}: sample {row} is {block.samples[row, column]}, "
-                "expected a finite number",
-            )
+            what = f"sample {row} is {block.samples[row, column]}, expected a finite number"
+            return self._refuse(Reason.NOT_FINITE, f"{which}, channel {channels[column]}: {what}")
         return None
 
     def _place(self, block: SampleBlock) -> Admission:  # noqa: PLR0911  # one return per case of the table
         """Accept a well-formed block if its time and sequence make sense."""
-        expected = self._expected
+        expected, schedule, which = self._expected, self._schedule, f"block {block.sequence}"
         if expected is None:
             self._follow(block)
             return Admission()
-        late_ns = block.start_ns - expected.start_ns
         if any(course.covers(block) for course in self._earlier):
-            return self._refuse(
-                Reason.OVERLAP,
-                f"block {block.sequence} of run {block.run} was received before the publisher restarted or "
-                "its clock was set: a repetition",
-            )
+            when = "before the publisher restarted or its clock was set"
+            return self._refuse(Reason.OVERLAP, f"{which} of run {block.run} was received {when}: a repetition")
         if any(course.covers(block) for course in self._refused):
-            return self._refuse(Reason.OVERLAP, f"block {block.sequence} was refused before: a repetition")
+            return self._refuse(Reason.OVERLAP, f"{which} was refused before: a repetition")
+        late_ns, restarted = block.start_ns - expected.start_ns, block.run != expected.run
+        missed = 0 if restarted else block.sequence - expected.sequence
         if abs(late_ns) <= self._tolerance_ns:
-            if block.run == expected.run and block.sequence != expected.sequence:
-                return self._resynchronise(
-                    block,
-                    Reason.SEQUENCE,
-                    f"sequence is {block.sequence} in a block that continues the previous one in time, expected "
-                    f"{expected.sequence}",
-                )
-            restarted = block.run != expected.run
+            if missed:
+                in_time = "in a block that continues the previous one in time"
+                text = f"sequence is {block.sequence} {in_time}, expected {expected.sequence}"
+                return self._resynchronise(block, Reason.SEQUENCE, text)
             self._follow(block)
             return Admission(text=f"{self._name}: the publisher restarted") if restarted else Admission()
         late_s = late_ns / 1e9
-        schedule = self._schedule
-        if (
-            schedule is not None
-            and schedule.is_silence(late_s)
-            and (block.run != expected.run or block.sequence == expected.sequence)
-        ):
+        if schedule is not None and schedule.is_silence(late_s) and not missed:
             self._follow(block)
             return Admission(new_snapshot=True)
+        start, if_it_stays = f"start_ns {block.start_ns}", "accepted if the clock stays there"
         if late_ns < 0:
-            same_run = block.run == expected.run
-            if same_run and block.sequence < expected.sequence:
-                return self._refuse(
-                    Reason.OVERLAP,
-                    f"block {block.sequence} starts {lasting(-late_s)} before the end of block "
-                    f"{expected.sequence - 1}: a repetition or out of order",
-                )
-            return self._resynchronise(
-                block,
-                Reason.PAST,
-                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(-late_s)} before what was "
-                "already received; accepted if the clock stays there",
-            )
+            if missed < 0:
+                before = f"{lasting(-late_s)} before the end of block {expected.sequence - 1}"
+                return self._refuse(Reason.OVERLAP, f"{which} starts {before}: a repetition or out of order")
+            text = f"{start} of {which} lies {lasting(-late_s)} before what was already received; {if_it_stays}"
+            return self._resynchronise(block, Reason.PAST, text)
         if late_s > self._settings.max_jump_s:
-            return self._resynchronise(
-                block,
-                Reason.FUTURE,
-                f"start_ns {block.start_ns} of block {block.sequence} lies {lasting(late_s)} ahead, expected at most "
-                f"{self._settings.max_jump_s:g} s; accepted if the clock stays there",
-            )
-        next_in_sequence = block.run == expected.run and block.sequence == expected.sequence
-        if next_in_sequence and late_s > _SURELY_S and schedule is None:
-            return self._resynchronise(
-                block,
-                Reason.FUTURE,
-                f"start_ns {block.start_ns} lies {lasting(late_s)} ahead although block {block.sequence} is the next "
-                "one; accepted if the clock stays there",
-            )
-        what = "the publisher restarted and " if block.run != expected.run else ""
-        missed = block.sequence - expected.sequence if block.run == expected.run else 0
+            most = f"expected at most {self._settings.max_jump_s:g} s"
+            text = f"{start} of {which} lies {lasting(late_s)} ahead, {most}; {if_it_stays}"
+            return self._resynchronise(block, Reason.FUTURE, text)
+        if not restarted and not missed and late_s > _SURELY_S and schedule is None:
+            text = f"{start} lies {lasting(late_s)} ahead although {which} is the next one; {if_it_stays}"
+            return self._resynchronise(block, Reason.FUTURE, text)
+        what = "the publisher restarted and " if restarted else ""
         blocks = f" ({missed} blocks)" if missed > 0 else ""
         self._follow(block)
         if schedule is not None and late_s > schedule.silence_s:
@@ -363,12 +312,10 @@ class Gate:
         new_run = candidate.run not in {course.run for course in self.courses}
         self._candidate = None
         self._change_course(candidate)
+        text = f"the stream's clock stepped by {lasting(step_s)}; following it"
         if new_run:
-            text = (
-                f"the publisher restarted, {lasting(abs(step_s))} {'earlier' if step_s < 0 else 'later'} in data time"
-            )
-        else:
-            text = f"the stream's clock stepped by {lasting(step_s)}; following it"
+            when = "earlier" if step_s < 0 else "later"
+            text = f"the publisher restarted, {lasting(abs(step_s))} {when} in data time"
         return Admission(text=f"{self._name}: {text}", clock_step_s=step_s, new_run=new_run)
 
     def _follow(self, block: SampleBlock) -> None:

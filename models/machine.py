@@ -8,8 +8,9 @@ Every field carries its unit in its name; unknown keys are refused. ``docs/machi
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Literal, Self
 
@@ -80,10 +81,8 @@ class AlarmLimits(BaseModel, extra="forbid", frozen=True):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if not self.clear_below < self.raise_above < self.danger_above:
-            raise ValueError(
-                f"expected clear_below < raise_above < danger_above, got {self.clear_below}, {self.raise_above}, "
-                f"{self.danger_above}"
-            )
+            got = f"{self.clear_below}, {self.raise_above}, {self.danger_above}"
+            raise ValueError(f"expected clear_below < raise_above < danger_above, got {got}")
         return self
 
 
@@ -93,6 +92,9 @@ def _known_alarms(field: str, names: Iterable[str]) -> None:
         hint = did_you_mean(unknown[0], ALARMS)
         known = f"{', '.join(ALARMS)} and {LEVEL}CHANNEL"
         raise ValueError(f"{field}: {', '.join(unknown)} is not an alarm; there are {known}{hint}")
+
+
+_WHEN = ("while_alarm", "below_rpm", "above_rpm")
 
 
 class SuppressRule(BaseModel, extra="forbid", frozen=True):
@@ -107,9 +109,9 @@ class SuppressRule(BaseModel, extra="forbid", frozen=True):
     @model_validator(mode="after")
     def _sensible(self) -> Self:
         _known_alarms("alarms", self.alarms)
-        given = [name for name in ("while_alarm", "below_rpm", "above_rpm") if getattr(self, name) is not None]
+        given = [name for name in _WHEN if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"expected exactly one of while_alarm, below_rpm, above_rpm; found {given or 'none'}")
+            raise ValueError(f"expected exactly one of {', '.join(_WHEN)}; found {given or 'none'}")
         if self.while_alarm is not None:
             _known_alarms("while_alarm", [self.while_alarm])
             if self.while_alarm in self.alarms:
@@ -125,11 +127,7 @@ class SuppressRule(BaseModel, extra="forbid", frozen=True):
         >>> SuppressRule(alarms=("model",), below_rpm=600, because="coasting down").identity
         'below_rpm=600.0'
         """
-        return next(
-            f"{name}={value}"
-            for name in ("while_alarm", "below_rpm", "above_rpm")
-            if (value := getattr(self, name)) is not None
-        )
+        return next(f"{name}={value}" for name in _WHEN if (value := getattr(self, name)) is not None)
 
 
 _NAME_CONFIDENCE = 0.9
@@ -226,98 +224,87 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        for fault in chain(self._faults_of_window(), self._faults_of_names(), self._faults_of_signals()):
+            raise ValueError(fault)
+        return self
+
+    def _faults_of_window(self) -> Iterator[str]:
+        window, rate_hz = self.window, self.rate_hz
         try:
             MachineKeys(self.site, self.name)
         except MachineFileError as error:
-            raise ValueError(str(error)) from error
+            yield str(error)
         for field in ("length_s", "hop_s", "segment_s", "lag_step_s"):
-            samples = getattr(self.window, field) * self.rate_hz
+            samples = getattr(window, field) * rate_hz
             if not whole(samples):
-                raise ValueError(
-                    f"window.{field} is {samples:.6g} samples at {self.rate_hz} Hz, expected a whole number"
-                )
-        if round(self.window.segment_s * self.rate_hz) % 2:
-            raise ValueError(
-                f"window.segment_s {self.window.segment_s} is an odd number of samples, expected an even one"
-            )
-        self._check_hops()
+                yield f"window.{field} is {samples:.6g} samples at {rate_hz} Hz, expected a whole number"
+        if round(window.segment_s * rate_hz) % 2:
+            yield f"window.segment_s {window.segment_s} is an odd number of samples, expected an even one"
+        yield from self._faults_of_hops()
         if self.schedule is None and not self.holds_band:
-            bins = (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s
-            raise ValueError(f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least {_BINS}")
+            bins = (window.band_hz[1] - window.band_hz[0]) * window.segment_s
+            yield f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least {_BINS}"
         if all(channel.quantity == "shaft_angle" for channel in self.sensors):
-            raise ValueError("sensors: a shaft angle alone shows no vibration, expected a displacement or velocity too")
+            yield "sensors: a shaft angle alone shows no vibration, expected a displacement or velocity too"
         slow = [sensor.name for sensor in self.sensors if sensor.slow_roll_um_pp is not None]
         if slow and all(sensor.quantity is not Quantity.SHAFT_ANGLE for sensor in self.sensors):
-            raise ValueError(
+            yield (
                 f"sensors: {slow[0]} has a slow-roll vector, and no sensor measures the shaft angle: without a phase "
                 "reference there is no vector at running speed that it could be taken from"
             )
-        if self.window.band_hz[1] >= self.rate_hz / 2:
-            raise ValueError(f"window.band_hz {self.window.band_hz} ends above half of rate_hz {self.rate_hz}")
-        _ = self.descriptor  # refuses duplicate channels
-        names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
-        from models.levels.unmeasured import unmeasured  # noqa: PLC0415  # it imports scipy, for which no --help waits
+        if window.band_hz[1] >= rate_hz / 2:
+            yield f"window.band_hz {window.band_hz} ends above half of rate_hz {rate_hz}"
 
-        speed_rpm = None if self.operation is None else self.operation.speed_rpm
-        if missing := unmeasured(self.levels, self.sensors, self.rate_hz, speed_rpm):
-            raise ValueError(missing)
-        for name in (*self.alarms.latching, *(name for rule in self.alarms.suppress for name in rule.alarms)):
-            if name.startswith(LEVEL) and name.removeprefix(LEVEL) not in names:
-                raise ValueError(f"alarms: {name}: no channel of that name; there are {', '.join(names)}")
-        return self
-
-    @model_validator(mode="after")
-    def _high_passes(self) -> Self:
-        begin_hz, most_us = self.window.band_hz[0], 1e6 * _MOST_OF_SEGMENT * self.window.segment_s
-        for sensor in self.sensors:
-            corner_hz = sensor.high_pass_hz or 0.0
-            if corner_hz >= self.rate_hz / 2:
-                raise ValueError(
-                    f"channel {sensor.name}: high_pass_hz is {corner_hz:g}, expected below half of rate_hz"
-                )
-            if abs(sensor.delay_us or 0.0) > most_us:
-                raise ValueError(
-                    f"channel {sensor.name}: delay_us is {sensor.delay_us:g}, expected at most {most_us:g}, a fiftieth "
-                    "of window.segment_s"
-                )
-            if self.holds_band and corner_hz > _MOST_OF_BAND * begin_hz and not state_name(sensor).startswith("@"):
-                raise ValueError(
-                    f"channel {sensor.name}: high_pass_hz is {corner_hz:g}, expected at most twice the lowest "
-                    f"frequency of window.band_hz, {begin_hz:g} Hz: what a high-pass takes far below its corner is "
-                    f"lost in noise; let the band begin at {corner_hz / _MOST_OF_BAND:g} Hz or above"
-                )
-        return self
-
-    def _check_hops(self) -> None:
-        """Refuse segments and lags that do not fit into a hop."""
+    def _faults_of_hops(self) -> Iterator[str]:
+        """Segments and lags that do not fit into a hop."""
         window, schedule = self.window, self.schedule
         if schedule is None:
             if window.hop_s > _LONGEST_HOP_S:  # all samples of a hop are held
-                raise ValueError(
-                    f"window.hop_s is {window.hop_s:g}, expected at most {_LONGEST_HOP_S:g}, or snapshots ([schedule])"
-                )
+                most = f"{_LONGEST_HOP_S:g}, or snapshots ([schedule])"
+                yield f"window.hop_s is {window.hop_s:g}, expected at most {most}"
             if not whole(2 * window.hop_s / window.segment_s):
-                raise ValueError(
-                    f"window.hop_s {window.hop_s} must be a multiple of half of segment_s {window.segment_s}"
-                )
+                yield f"window.hop_s {window.hop_s} must be a multiple of half of segment_s {window.segment_s}"
             return
         if abs(window.hop_s - schedule.every_s) > 1e-9 * schedule.every_s:
-            raise ValueError(
-                f"window.hop_s is {window.hop_s:g}, but a hop is a snapshot, one every {schedule.every_s:g} s "
-                "([schedule] every_s): leave it out"
-            )
+            every = f"one every {schedule.every_s:g} s ([schedule] every_s)"
+            yield f"window.hop_s is {window.hop_s:g}, but a hop is a snapshot, {every}: leave it out"
         for field in ("segment_s", "lag_to_s"):
-            value = getattr(window, field)
-            if value > schedule.on_s / 2:
-                raise ValueError(
-                    f"window.{field} is {value:g}, expected at most half of a snapshot, {schedule.on_s / 2:g} "
-                    "([schedule] on_s)"
-                )
+            value, most_s = getattr(window, field), schedule.on_s / 2
+            if value > most_s:
+                most = f"half of a snapshot, {most_s:g} ([schedule] on_s)"
+                yield f"window.{field} is {value:g}, expected at most {most}"
         if self.ingest.no_data_after_s <= schedule.silence_s:
-            raise ValueError(
-                f"ingest.no_data_after_s is {self.ingest.no_data_after_s:g}, expected more than the silence between "
-                f"snapshots, {schedule.silence_s:g} s"
-            )
+            silence = f"the silence between snapshots, {schedule.silence_s:g} s"
+            yield f"ingest.no_data_after_s is {self.ingest.no_data_after_s:g}, expected more than {silence}"
+
+    def _faults_of_names(self) -> Iterator[str]:
+        _ = self.descriptor  # refuses duplicate channels
+        names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
+        from models.levels.limits import unmeasured  # noqa: PLC0415  # it imports scipy, for which no --help waits
+
+        speed_rpm = None if self.operation is None else self.operation.speed_rpm
+        if missing := unmeasured(self.levels, self.sensors, self.rate_hz, speed_rpm):
+            yield missing
+        for name in (*self.alarms.latching, *(name for rule in self.alarms.suppress for name in rule.alarms)):
+            if name.startswith(LEVEL) and name.removeprefix(LEVEL) not in names:
+                yield f"alarms: {name}: no channel of that name; there are {', '.join(names)}"
+
+    def _faults_of_signals(self) -> Iterator[str]:
+        begin_hz, most_us = self.window.band_hz[0], 1e6 * _MOST_OF_SEGMENT * self.window.segment_s
+        for sensor in self.sensors:
+            corner_hz = sensor.high_pass_hz or 0.0
+            high_pass = f"channel {sensor.name}: high_pass_hz is {corner_hz:g}"
+            if corner_hz >= self.rate_hz / 2:
+                yield f"{high_pass}, expected below half of rate_hz"
+            if abs(sensor.delay_us or 0.0) > most_us:
+                most = f"{most_us:g}, a fiftieth of window.segment_s"
+                yield f"channel {sensor.name}: delay_us is {sensor.delay_us:g}, expected at most {most}"
+            if self.holds_band and corner_hz > _MOST_OF_BAND * begin_hz and not state_name(sensor).startswith("@"):
+                yield (
+                    f"{high_pass}, expected at most twice the lowest frequency of window.band_hz, {begin_hz:g} Hz: "
+                    "what a high-pass takes far below its corner is lost in noise; let the band begin at "
+                    f"{corner_hz / _MOST_OF_BAND:g} Hz or above"
+                )
 
     @property
     def hop_data_s(self) -> float:
@@ -357,15 +344,9 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     @property
     def descriptor(self) -> ChannelDescriptor:
         """What the machine's stream must look like."""
-        return ChannelDescriptor.model_validate(
-            {
-                "site": self.site,
-                "machine": self.name,
-                "rate_hz": self.rate_hz,
-                "dtype": self.dtype,
-                "channels": [sensor.model_dump(include=set(Channel.model_fields)) for sensor in self.sensors],
-            }
-        )
+        stream = {"site": self.site, "machine": self.name, "rate_hz": self.rate_hz, "dtype": self.dtype}
+        channels = [sensor.model_dump(include=set(Channel.model_fields)) for sensor in self.sensors]
+        return ChannelDescriptor.model_validate({**stream, "channels": channels})
 
 
 class Machine(MachineFile):

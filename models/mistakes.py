@@ -8,6 +8,7 @@ import difflib
 import os
 import re
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from datetime import date
@@ -81,12 +82,7 @@ def _open_without_waiting(path: str, flags: int) -> int:
 
 
 def parse_toml(text: str, place: object) -> dict[str, object]:
-    """Parse TOML.
-
-    Parameters
-    ----------
-    place : object
-        What the message begins with: the file, or the argument.
+    """Parse TOML; messages begin with the place, which is the file or the argument.
 
     Raises
     ------
@@ -104,17 +100,12 @@ def parse_toml(text: str, place: object) -> dict[str, object]:
 
 
 def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
-    """Merge changes into the fields of a file: tables name by name, while anything else is replaced.
-
-    Parameters
-    ----------
-    changes : str
-        TOML.
+    """Merge changes, in TOML, into the fields of a file: tables name by name, while anything else is replaced.
 
     Raises
     ------
     MachineFileError
-        If it is not TOML.
+        If they are not TOML.
 
     Examples
     --------
@@ -132,12 +123,7 @@ def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
 
 
 def checked(model: type[_Model], fields: object, place: object) -> _Model:
-    """Turn the fields of a file into the record they describe.
-
-    Parameters
-    ----------
-    place : object
-        What the messages begin with: the file, or the argument.
+    """Turn the fields of a file into the record they describe; messages begin with the place, see `parse_toml`.
 
     Raises
     ------
@@ -200,20 +186,12 @@ def in_folder(model: _Model, folder: Path) -> _Model:
 
 
 def mistakes(error: ValidationError, model: type[BaseModel], fields: object = None) -> tuple[tuple[_Place, str], ...]:
-    """What is wrong, mistake by mistake; the first ones, if there are very many.
+    """What is wrong, mistake by mistake: place and text, which begins with the place; the first ones of very many.
 
-    Parameters
-    ----------
-    fields : object, optional
-        What was checked; lets a message name the entry of a list.
-
-    Returns
-    -------
-    tuple of (place, text)
-        The place as a path of names and numbers; the text begins with it.
+    `fields` are what was checked; with them a message names the entry of a list.
     """
     found = error.errors(include_url=False)[:_MOST_TOLD]
-    texts: dict[_Place, list[str]] = {}
+    texts = defaultdict[_Place, list[str]](list)
     meant: set[_Place] = set()
     for one in found:
         if one["type"] == "extra_forbidden":
@@ -226,32 +204,22 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
         within = any(other["loc"][: len(place)] == place and len(other["loc"]) > len(place) for other in found)
         if one["type"] == "extra_forbidden" or place in meant or (one["type"] in {"too_short", "too_long"} and within):
             continue
+        told = texts[place]
         if one["type"] == "unexpected_keyword_argument":
-            texts.setdefault(place, []).append("unknown")
+            told.append("unknown")
         elif one["type"] == "missing":
-            texts.setdefault(place, []).append(_missing(place, one["loc"], info))
+            told.append(_missing(place, one["loc"], info))
         elif one["type"] in {"value_error", "assertion_error"}:
-            texts.setdefault(place, []).append(one["msg"].removeprefix("Value error, "))
+            told.append(one["msg"].removeprefix("Value error, "))
+        elif told and told[-1].startswith("expected "):  # one of several kinds of value would do
+            told[-1] = f"{told[-1].removesuffix(_shown(one))} or {expectation(one, info).removeprefix('expected ')}"
         else:
-            wanted_text = expectation(one, info)
-            before = texts.get(place)
-            if before and before[-1].startswith("expected "):  # one of several kinds of value would do
-                before[-1] = f"{before[-1].removesuffix(_shown(one))} or {wanted_text.removeprefix('expected ')}"
-            else:
-                texts.setdefault(place, []).append(wanted_text)
+            told.append(expectation(one, info))
     return tuple((place, f"{_named(place, fields)}{text}") for place, several in texts.items() for text in several)
 
 
 def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
-    """What was expected and what was found, of a single fault.
-
-    Parameters
-    ----------
-    fault : ErrorDetails
-        One of `ValidationError.errors`.
-    info : FieldInfo, optional
-        The field, whose range the text gives with both ends.
-    """
+    """What was expected and found, for one of `ValidationError.errors`; with its field also both ends of a range."""
     kind, context, value = fault["type"], fault.get("ctx", {}), fault["input"]
     between = "" if info is None else _range(info)
     hint = ""
@@ -292,10 +260,7 @@ def form(pattern: str, words: str) -> str:
 def plainly(fault: Mapping[str, Any]) -> str:
     """What is wrong with an argument, a field of a body or of a message; its name goes before it.
 
-    Parameters
-    ----------
-    fault : mapping
-        One of `ValidationError.errors`, or one made elsewhere with only its place and ``msg``.
+    The fault is one of `ValidationError.errors`, or was made elsewhere with only its place and ``msg``.
     """
     kind = fault.get("type", "value_error")
     if kind in {"missing", "extra_forbidden"}:
@@ -322,13 +287,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def argument_text(error: Exception) -> str | None:
-    """What was expected of an argument of a command, if it was refused by the same checks as fields of files.
-
-    Parameters
-    ----------
-    error : Exception
-        The refusal of the argument; its cause says why.
-    """
+    """What was expected of an argument of a command, if the cause of its refusal are the checks of fields of files."""
     cause = error.__cause__
     return expectation(cause.errors(include_url=False)[0]) if isinstance(cause, ValidationError) else None
 
@@ -349,10 +308,8 @@ def _unreadable(message: str, text: str) -> str:
         return f"cannot be read as TOML: {message[0].lower()}{message[1:]}"
     number, line = int(where[1]), text.splitlines()[int(where[1]) - 1].strip()
     said = message[: where.start()]
-    for pattern, plain in _UNREADABLE:
-        if (match := re.fullmatch(pattern, said)) is not None:
-            said = plain.format(**match.groupdict())
-            break
+    matches = ((plain, re.fullmatch(pattern, said)) for pattern, plain in _UNREADABLE)
+    said = next((plain.format(**match.groupdict()) for plain, match in matches if match), said)
     if re.search(r"=\s*[-+]?\d+,\d", line):
         said = "a number has a decimal point, not a comma"
     return f"line {number}: {said[0].lower()}{said[1:]}: {line[:_LONGEST_SHOWN]}"

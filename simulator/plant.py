@@ -144,14 +144,8 @@ def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
     factor = 1 + condition.anomalies.get("added_mass", 0.0)
     if factor == 1:
         return rotor
-    return rotor.model_copy(
-        update={
-            "m2_kg": rotor.m2_kg * factor,
-            "I2_kg_m2": rotor.I2_kg_m2 * factor,
-            "I2p_kg_m2": rotor.I2p_kg_m2 * factor,
-            "e_m": rotor.e_m / factor,
-        }
-    )
+    grown = {name: getattr(rotor, name) * factor for name in ("m2_kg", "I2_kg_m2", "I2p_kg_m2")}
+    return rotor.model_copy(update={**grown, "e_m": rotor.e_m / factor})
 
 
 def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
@@ -200,9 +194,8 @@ def crack_stiffness(rotor: RotorParameters, theta_rad: FloatArray) -> FloatArray
     """
     plane = Q_shaft(rotor)[:3, :3]
     mirror = np.diag([1.0, 1.0, -1.0])
-    along = np.concatenate(
-        [np.cos(theta_rad)[:, None, None] * np.eye(3), np.sin(theta_rad)[:, None, None] * mirror], axis=2
-    )
+    cosine, sine = np.cos(theta_rad)[:, None, None], np.sin(theta_rad)[:, None, None]
+    along = np.concatenate([cosine * np.eye(3), sine * mirror], axis=2)
     opening = (1 + np.sin(theta_rad)) / 2
     return np.asarray(opening[:, None, None] * (along.transpose(0, 2, 1) @ plane @ along), dtype=np.float64)
 
@@ -228,13 +221,7 @@ class NonlinearPlant(Plant):
             self._start_revolution, self._since_change = 0.0, 0
 
     def advance(self, n_samples: int) -> PlantSamples:
-        """Return the next `n_samples` samples and move on.
-
-        Raises
-        ------
-        EstimationError
-            If friction makes the motion of the disc unstable.
-        """
+        """Return the next `n_samples` samples and move on."""
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)
         theta = self._angles(n_samples)
@@ -269,15 +256,9 @@ class NonlinearPlant(Plant):
         if stiffness:
             if condition.rub is None:
                 raise ValueError("a rub without clearance, expected Condition.rub")
-            shaft_N_per_m = 3 * rotor.EI_N_m2 / rotor.shaft_length_m**3
-            self._contact = _Contact(
-                self._A,
-                rotor.m2_kg,
-                stiffness * shaft_N_per_m,
-                condition.rub.clearance_m,
-                condition.rub.friction,
-                1 / self._machine.rate_hz,
-            )
+            rub, shaft_N_per_m = condition.rub, 3 * rotor.EI_N_m2 / rotor.shaft_length_m**3
+            contact_N_per_m, step_s = stiffness * shaft_N_per_m, 1 / self._machine.rate_hz
+            self._contact = _Contact(self._A, rotor.m2_kg, contact_N_per_m, rub.clearance_m, rub.friction, step_s)
 
     def _periodic(self, rotor: RotorParameters, depth: float, condition: Condition) -> FloatArray:
         """Fourier coefficients over θ of (F, g) in d ← F d + g, one sample; shape (2 · harmonics + 1, n · (n + 1))."""
@@ -320,10 +301,8 @@ class NonlinearPlant(Plant):
             turn = transition @ turn
         largest = float(np.max(np.abs(np.linalg.eigvals(turn))))
         if largest >= 1:
-            raise EstimationError(
-                f"machine {self._machine.name}: a crack of {depth:g} is unstable, the motion grows by a factor of "
-                f"{largest:.4g} a turn at {self._speed_rpm:g} rpm, expected below 1"
-            )
+            grows = f"the motion grows by a factor of {largest:.4g} a turn at {self._speed_rpm:g} rpm, expected below 1"
+            raise EstimationError(f"machine {self._machine.name}: a crack of {depth:g} is unstable, {grows}")
 
 
 class _Contact:

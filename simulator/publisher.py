@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Event
+from typing import NamedTuple
 
 import zenoh
 import zenoh.ext
@@ -26,8 +27,6 @@ from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
-DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
-_LOCAL = LinkSettings(connect=(DEFAULT_CONNECT,))
 _CACHE_BLOCKS = 1200  # two minutes in blocks of 0.1 s: a window, and the time that a monitor takes to come back
 _CACHE_TRUTH = 100
 _HEARTBEAT_S = 0.5
@@ -44,7 +43,7 @@ class PublishError(RotorwatchError):
 class PublishSettings:
     """How to publish."""
 
-    link: LinkSettings = _LOCAL  # endpoints; connects to a local monitor by default
+    link: LinkSettings
     pace: float | None = 1.0  # data seconds per second; None is as fast as the subscribers take it
     encoding: BlockEncoding = "raw"
     wait_for_subscriber_s: float | None = None  # hold the first block back until someone subscribes, at most this long
@@ -90,15 +89,13 @@ def publish(
         return summary
 
 
-@dataclass(frozen=True, slots=True)
-class _Outlets:
+class _Outlets(NamedTuple):
     stream: zenoh.ext.AdvancedPublisher
     descriptor: zenoh.ext.AdvancedPublisher
     truth: zenoh.ext.AdvancedPublisher
 
 
-@contextmanager
-def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
+def _session(settings: PublishSettings) -> zenoh.Session:
     items = settings.link.zenoh_items()
     if settings.pace is None:
         # By default Zenoh closes the connection to a subscriber that blocks for five seconds; a monitor that evaluates
@@ -114,15 +111,11 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
             reason = re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))  # without the source lines of the library
             raise MachineFileError(f"link setting {path}{shown} is refused: {reason}") from error
     try:
-        session = zenoh.open(config)
+        return zenoh.open(config)
     except zenoh.ZError as error:
         link = settings.link
         ends = f"listen {list(link.listen)}, connect {list(link.connect)}"
         raise PublishError(f"no Zenoh session ({ends}): {link.explain(str(error))}") from error
-    try:
-        yield session
-    finally:
-        session.close()  # type: ignore[no-untyped-call]  # the stub says nothing of what it returns
 
 
 @contextmanager
@@ -148,13 +141,9 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
     def answer(query: zenoh.Query) -> None:
         query.reply(keys.descriptor, descriptor, encoding=JSON_ENCODING)
 
-    outlets = _Outlets(
-        stream=outlet(keys.stream, _CACHE_BLOCKS),
-        descriptor=outlet(keys.descriptor, 1),
-        truth=outlet(keys.truth, _CACHE_TRUTH),
-    )
+    outlets = _Outlets(outlet(keys.stream, _CACHE_BLOCKS), outlet(keys.descriptor, 1), outlet(keys.truth, _CACHE_TRUTH))
     declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken]
-    declared = [outlets.stream, outlets.descriptor, outlets.truth, session.declare_queryable(keys.descriptor, answer)]
+    declared = [*outlets, session.declare_queryable(keys.descriptor, answer)]
     declared.append(session.liveliness().declare_token(keys.publisher_alive))
     try:
         yield outlets
@@ -208,13 +197,8 @@ def _send(
         elapsed_s = time.monotonic() - begin
         if elapsed_s >= look_s:
             look_s, heard = elapsed_s + _SUBSCRIBER_CHECK_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
-        summary = RunSummary(
-            blocks=summary.blocks + 1,
-            data_s=data_s,
-            elapsed_s=elapsed_s,
-            truth=truth[-1] if truth else summary.truth,
-            heard=heard,
-        )
+        latest = truth[-1] if truth else summary.truth
+        summary = RunSummary(summary.blocks + 1, data_s, elapsed_s, latest, heard)
         if on_block is not None:
             on_block(summary)
     return summary

@@ -4,9 +4,9 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -140,13 +140,8 @@ def publish(
     from simulator.publisher import PublishSettings  # noqa: PLC0415  # keeps --help quick
     from simulator.publisher import publish as publish_stream  # noqa: PLC0415
 
-    settings = PublishSettings(
-        link=_link(link_file, mode, listen, connect),
-        pace=factor,
-        encoding=encoding,
-        wait_for_subscriber_s=wait_for_subscriber_s,
-        linger_s=linger_s,
-    )
+    link = _link(link_file, mode, listen, connect)
+    settings = PublishSettings(link, factor, encoding, wait_for_subscriber_s, linger_s)
     number = int(time.time()) % 65535 + 1 if run is None else run
     with _stop_on_signal() as stop, _progress(loaded.duration_s, rig.keys.stream) as on_block:
         stream = _stream(loaded, rig, block_s, start_ns, number)
@@ -189,7 +184,7 @@ def record(
     for existing in (output, output.with_name(output.name + ".part")):
         if existing.exists() and not overwrite:
             raise MachineFileError(f"{existing}: already exists; --overwrite replaces it")
-    from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
+    from simulator.stream import record as record_stream  # noqa: PLC0415  # keeps --help quick
 
     with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
         stream = _stream(loaded, rig, block_s, start_ns, run)
@@ -223,22 +218,19 @@ def _stream(scenario: Scenario, machine: Machine, block_s: float, start_ns: int 
 
 def _link(file: Path | None, mode: _Mode | None, listen: list[str] | None, connect: list[str] | None) -> LinkSettings:
     """Settings of the file, with those of the command line in their place; a local monitor if there are neither."""
-    from simulator.publisher import DEFAULT_CONNECT  # noqa: PLC0415  # keeps --help quick
-
     update: dict[str, object] = {} if mode is None else {"mode": mode}
     if listen or connect:
         update |= {"listen": tuple(listen or ()), "connect": tuple(connect or ())}
-    link = LinkSettings(connect=(DEFAULT_CONNECT,)) if file is None else load_link(file)
+    link = LinkSettings(connect=("tcp/127.0.0.1:7447",)) if file is None else load_link(file)
     return link.model_copy(update=update)
 
 
 def _pace(text: str) -> float | None:
     if text == "max":
         return None
-    try:
+    pace = 0.0
+    with suppress(ValueError):
         pace = float(text)
-    except ValueError:
-        pace = 0.0
     if not 0 < pace <= 1e4:
         raise MachineFileError(f"--pace is {text!r}, expected a number above 0 (1 is real time) or max")
     return pace
@@ -251,10 +243,10 @@ def _time_ns(text: str) -> int:
         raise MachineFileError(f"--start is {text!r}, expected ISO 8601 such as 2026-01-01T00:00:00Z") from error
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
-    if not datetime(1970, 1, 1, tzinfo=UTC) <= moment < datetime(2262, 1, 1, tzinfo=UTC):
+    epoch = datetime(1970, 1, 1, tzinfo=UTC)
+    if not epoch <= moment < datetime(2262, 1, 1, tzinfo=UTC):
         raise MachineFileError(f"--start is {text!r}, expected a time from 1970 to 2261")
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return ((since.days * 86400 + since.seconds) * 10**6 + since.microseconds) * 1000
+    return (moment - epoch) // timedelta(microseconds=1) * 1000
 
 
 @contextmanager
@@ -280,40 +272,9 @@ def _stop_on_signal() -> Iterator[threading.Event]:
         listener.join()
 
 
-class _ProgressLine:
-    """Data time, pace and current truth, as a bar on a terminal and as lines elsewhere; and whether anybody listens."""
-
-    def __init__(self, progress: Progress, duration_s: float, key: str) -> None:
-        self._progress, self._duration_s, self._key = progress, duration_s, key
-        self._task = progress.add_task("", total=duration_s, pace=0.0, truth="")
-        self._heard: bool | None = True
-        self._next_s = _FIRST_LINE_S
-
-    def __call__(self, summary: "RunSummary") -> None:
-        truth = "" if summary.truth is None else summary.truth.text
-        self._progress.update(self._task, completed=summary.data_s, pace=summary.pace, truth=escape(truth))
-        if summary.heard is not None and summary.heard != self._heard:
-            self._heard = summary.heard
-            self._say(
-                f"{self._key} now has a subscriber"
-                if summary.heard
-                else f"{self._key} has no subscriber: is a monitor running (rotorwatch run), and is it "
-                "at the address given by --connect?"
-            )
-        if self._progress.disable and summary.elapsed_s >= self._next_s:
-            self._next_s = summary.elapsed_s + _LINE_S
-            done = f"{summary.data_s:.1f} of {self._duration_s:.1f} s of data"
-            self._say(f"{done}, {summary.pace:.1f} x real time, {truth}")
-
-    def _say(self, text: str) -> None:
-        if self._progress.disable:
-            typer.echo(text, err=True)
-        else:
-            self._progress.console.print(text, style="yellow", markup=False, highlight=False)
-
-
 @contextmanager
-def _progress(duration_s: float, key: str) -> Iterator[_ProgressLine]:
+def _progress(duration_s: float, key: str) -> Iterator[Callable[["RunSummary"], None]]:
+    """Data time, pace and current truth, as a bar on a terminal and as lines elsewhere; and whether anybody listens."""
     console = Console(stderr=True)
     columns = (
         BarColumn(bar_width=20),
@@ -321,8 +282,30 @@ def _progress(duration_s: float, key: str) -> Iterator[_ProgressLine]:
         TextColumn("{task.fields[pace]:.1f} x real time"),
         TextColumn("{task.fields[truth]}"),
     )
+    heard, next_s = True, _FIRST_LINE_S
     with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=5) as progress:
-        yield _ProgressLine(progress, duration_s, key)
+        task = progress.add_task("", total=duration_s, pace=0.0, truth="")
+
+        def say(text: str) -> None:
+            if progress.disable:
+                typer.echo(text, err=True)
+            else:
+                console.print(text, style="yellow", markup=False, highlight=False)
+
+        def on_block(summary: "RunSummary") -> None:
+            nonlocal heard, next_s
+            truth = "" if summary.truth is None else summary.truth.text
+            progress.update(task, completed=summary.data_s, pace=summary.pace, truth=escape(truth))
+            if summary.heard is not None and summary.heard != heard:
+                heard = summary.heard
+                no = f"{key} has no subscriber: is a monitor running (rotorwatch run), and is it at the address given"
+                say(f"{key} now has a subscriber" if heard else f"{no} by --connect?")
+            if progress.disable and summary.elapsed_s >= next_s:
+                next_s = summary.elapsed_s + _LINE_S
+                done = f"{summary.data_s:.1f} of {duration_s:.1f} s of data"
+                say(f"{done}, {summary.pace:.1f} x real time, {truth}")
+
+        yield on_block
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ def calibrate(
     """
     with _running():
         from models.machine import load_machine  # noqa: PLC0415  # start-up stays free of numpy
-        from simulator.training.calibration import calibrate_again  # noqa: PLC0415
+        from simulator.training.command import calibrate_again  # noqa: PLC0415
 
         calibrate_again(load_machine(machine), bundle, out, processes)
 

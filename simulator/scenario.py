@@ -147,10 +147,8 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             return
         given = [name for name in ("cutoff_hz", "force_rms_N", "direction") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                f"change of source {self.source!r}: expected exactly one of cutoff_hz, force_rms_N, direction; "
-                f"found {' and '.join(given) or 'none'}"
-            )
+            wrong = f"expected exactly one of cutoff_hz, force_rms_N, direction; found {' and '.join(given) or 'none'}"
+            raise ValueError(f"change of source {self.source!r}: {wrong}")
 
     def _check_anomaly(self) -> None:
         if self.anomaly is None:
@@ -161,27 +159,23 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
         if self.size is None:
             raise ValueError(f"anomaly {self.anomaly} without size")
         if self.size > ANOMALIES[self.anomaly]:
-            raise ValueError(
-                f"size of anomaly {self.anomaly} is {self.size}, expected 0 to {ANOMALIES[self.anomaly]:g}"
-            )
+            most = ANOMALIES[self.anomaly]
+            raise ValueError(f"size of anomaly {self.anomaly} is {self.size}, expected 0 to {most:g}")
 
     def _check_sensor(self) -> None:
         if self.sensor is None:
             return
         if self.sensor_fault is None:
             raise ValueError(f"sensor {self.sensor!r} without sensor_fault")
-        if (self.sensor_fault in SENSOR_FAULTS_WITH_VALUE) != (self.value_SI is not None):
-            need = "needs" if self.sensor_fault in SENSOR_FAULTS_WITH_VALUE else "has no"
-            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} value_SI")
-        if (self.sensor_fault == "swapped") != (self.swapped_with is not None):
-            need = "needs" if self.sensor_fault == "swapped" else "has no"
-            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} swapped_with")
+        for field, kinds in (("value_SI", SENSOR_FAULTS_WITH_VALUE), ("swapped_with", ("swapped",))):
+            needed = self.sensor_fault in kinds
+            if needed != (getattr(self, field) is not None):
+                raise ValueError(f"sensor_fault {self.sensor_fault!r} {'needs' if needed else 'has no'} {field}")
         if self.swapped_with == self.sensor:
             raise ValueError(f"swapped_with is {self.swapped_with!r}, expected another channel than {self.sensor!r}")
         if self.sensor_fault == "delay" and not 0 <= (self.value_SI or 0.0) <= LONGEST_DELAY_S:
-            raise ValueError(
-                f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected 0 to {LONGEST_DELAY_S:g} s"
-            )
+            expected = f"0 to {LONGEST_DELAY_S:g} s"
+            raise ValueError(f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected {expected}")
         if self.sensor_fault in ("noise_relative", "clip") and (self.value_SI or 0.0) < 0:
             raise ValueError(f"value_SI of sensor_fault {self.sensor_fault!r} is {self.value_SI}, expected 0 or more")
         if self.ramp_s > 0 and self.sensor_fault not in _WITH_RAMP:
@@ -215,63 +209,43 @@ class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             if event.anomaly == "rub" and self.rub is None:
                 raise ValueError(f"events.{number}.anomaly: a rub needs the table [rub] with its clearance_m")
             if event.at_s + event.ramp_s > self.duration_s:
-                raise ValueError(
-                    f"events.{number}: ends at {event.at_s + event.ramp_s:g} s, after duration_s {self.duration_s:g}"
-                )
+                end_s = event.at_s + event.ramp_s
+                raise ValueError(f"events.{number}: ends at {end_s:g} s, after duration_s {self.duration_s:g}")
         return self
 
     def check_channels(self, machine: Machine) -> None:
         """Check that every channel the scenario names is one of the machine's, and that swaps are possible.
 
-        Raises
-        ------
-        MachineFileError
-            Naming the scenario, the field, the unknown channel, and the channels the machine has; or two channels that
-            cannot be swapped because they measure different quantities or in different units.
+        Channels of different quantities or units cannot be swapped. Raises `MachineFileError`.
         """
-        known = [channel.name for channel in machine.sensors]
+        known = {channel.name: channel for channel in machine.sensors}
         named = [(f"sensors.channels.{name}", name) for name in self.sensors.channels]
-        named += [(f"events.{n}.sensor", e.sensor) for n, e in enumerate(self.events) if e.sensor is not None]
-        named += [
-            (f"events.{n}.swapped_with", e.swapped_with)
-            for n, e in enumerate(self.events)
-            if e.swapped_with is not None
-        ]
+        for field in ("sensor", "swapped_with"):
+            of_events = [(number, getattr(event, field)) for number, event in enumerate(self.events)]
+            named += [(f"events.{number}.{field}", name) for number, name in of_events if name is not None]
         for field, name in named:
             if name not in known:
-                raise MachineFileError(
-                    f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
-                    f"({', '.join(known)}){did_you_mean(name, known)}"
-                )
-
-        of = {channel.name: channel for channel in machine.sensors}
+                others = f"machine {machine.name} ({', '.join(known)}){did_you_mean(name, known)}"
+                raise MachineFileError(f"scenario {self.name}: {field}: {name!r} is not a channel of {others}")
         for number, event in enumerate(self.events):
             if event.sensor is None or event.swapped_with is None:
                 continue
-            one, other = of[event.sensor], of[event.swapped_with]
+            one, other = known[event.sensor], known[event.swapped_with]
             if (one.quantity, one.unit) != (other.quantity, other.unit):
-                raise MachineFileError(
-                    f"scenario {self.name}: events.{number}.swapped_with: {other.name} is a {other.quantity} in "
-                    f"{other.unit}, expected a {one.quantity} in {one.unit} like {one.name}"
-                )
+                found = f"{other.name} is a {other.quantity} in {other.unit}"
+                expected = f"expected a {one.quantity} in {one.unit} like {one.name}"
+                raise MachineFileError(f"scenario {self.name}: events.{number}.swapped_with: {found}, {expected}")
 
     def overridden(
         self, *, seed: int | None = None, duration_s: float | None = None, faults: Sequence[Event] = ()
     ) -> "Scenario":
         """Return the scenario with another seed or duration and with events added, checked again.
 
-        Raises
-        ------
-        MachineFileError
-            If the result is not a valid scenario (an event after the new end, say).
+        Raises `MachineFileError` if the result is not a valid scenario (an event after the new end, say).
         """
-        fields = self.model_dump(exclude={"events"})
-        fields["events"] = [event.model_dump() for event in (*self.events, *faults)]
-        if seed is not None:
-            fields["seed"] = seed
-        if duration_s is not None:
-            fields["duration_s"] = duration_s
-        return checked(Scenario, fields, self.name)
+        others = {"seed": seed, "duration_s": duration_s}
+        fields = self.model_dump() | {name: value for name, value in others.items() if value is not None}
+        return checked(Scenario, fields | {"events": [one.model_dump() for one in (*self.events, *faults)]}, self.name)
 
 
 def shipped_scenarios() -> tuple[str, ...]:
@@ -329,10 +303,8 @@ def _locate(name_or_path: str | Path, folder: Path) -> Path:
     path = folder / name_or_path
     if not path.is_file():
         known = [*shipped_scenarios(), *(entry.name for entry in path.parent.glob("*.toml"))]
-        raise MachineFileError(
-            f"{path}: no such scenario file; shipped scenarios: {', '.join(shipped_scenarios())}"
-            f"{did_you_mean(path.name, known)}"
-        )
+        names, hint = ", ".join(shipped_scenarios()), did_you_mean(path.name, known)
+        raise MachineFileError(f"{path}: no such scenario file; shipped scenarios: {names}{hint}")
     return path
 
 
@@ -350,8 +322,7 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict[str, object]:
         base = _merged(_locate(base_name, path.parent), (*seen, path.resolve()))
     except MachineFileError as error:
         raise MachineFileError(f"{path}: extends: {error}") from error
-    base.pop("name", None)
-    base.pop("description", None)
+    base = {key: value for key, value in base.items() if key not in {"name", "description"}}
     for key, value in own.items():
         below = base.get(key)
         base[key] = {**below, **value} if isinstance(below, dict) and isinstance(value, dict) else value

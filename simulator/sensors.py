@@ -130,18 +130,12 @@ class SensorBank:
         self._dtype = np.dtype(machine.dtype)
         first_us = min(0.0, *(one.delay_us or 0.0 for one in machine.sensors))
         self._faults = faults
-        self._sensors = [
-            SimulatedSensor(
-                channel,
-                sensors.settings(channel),
-                _reference(channel, moments),
-                machine.rate_hz,
-                rng,
-                max((_value(kinds, "delay", 0.0) for _, kinds in faults.get(channel.name, ())), default=0.0),
-                ((channel.delay_us or 0.0) - first_us) * 1e-6,
-            )
-            for channel, rng in zip(machine.sensors, rngs, strict=True)
-        ]
+        self._sensors = []
+        for channel, rng in zip(machine.sensors, rngs, strict=True):
+            settings, rms_SI = sensors.settings(channel), _reference(channel, moments)
+            longest_s = max((_value(kinds, "delay", 0.0) for _, kinds in faults.get(channel.name, ())), default=0.0)
+            late_s = ((channel.delay_us or 0.0) - first_us) * 1e-6
+            self._sensors.append(SimulatedSensor(channel, settings, rms_SI, machine.rate_hz, rng, longest_s, late_s))
 
     def measure(self, plant: PlantSamples, first: int) -> npt.NDArray[np.float32] | FloatArray:
         """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype."""

@@ -1,13 +1,16 @@
-"""A scenario as a stream of sample blocks and truth records, and the messages they are sent or recorded as.
+"""A scenario as a stream of sample blocks and truth records, the messages they are sent as, and recording them.
 
 The same scenario and seed give bit-identical samples whatever the length of the blocks: samples are made in pieces on a
 grid of their own and only then cut into blocks. A piece ends at a change of the plant, but not at one of a sensor, so
 that a sensor's fault or setting never changes the motion of the machine.
 """
 
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import numpy as np
@@ -16,6 +19,7 @@ from pydantic import BaseModel, Field
 
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_arrow, encode_block
 from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_moments
 from simulator.scenario import NamedSource, Scenario
@@ -157,13 +161,8 @@ class _Simulation:
         nonlinear = any(NONLINEAR & set(condition.anomalies) for _, condition in timeline.conditions)
         plant = NonlinearPlant if nonlinear else Plant
         self._plant = plant(machine, initial, np.random.default_rng(plant_seed))
-        self._sensors = SensorBank(
-            machine,
-            scenario.sensors,
-            theoretical_moments(machine, initial),
-            timeline.sensor_faults,
-            [np.random.default_rng(seed) for seed in sensor_seeds],
-        )
+        moments, rngs = theoretical_moments(machine, initial), [np.random.default_rng(seed) for seed in sensor_seeds]
+        self._sensors = SensorBank(machine, scenario.sensors, moments, timeline.sensor_faults, rngs)
         self._made = self._taken = 0
         self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
 
@@ -224,3 +223,49 @@ class _Simulation:
 
     def time_ns(self, sample: int) -> int:
         return self._start_ns + round(sample * 1e9 / self._machine.rate_hz)
+
+
+def record(
+    machine: MachineFile,
+    stream: BlockStream,
+    path: Path,
+    *,
+    encoding: BlockEncoding = "raw",
+    overwrite: bool = False,
+    stop: Event | None = None,
+    on_block: Callable[[RunSummary], None] | None = None,
+) -> RunSummary:
+    """Record descriptor, truth and blocks under the keys a publisher would use.
+
+    All times in the file are data time: a block is logged at the time of the sample after its last one, when a real
+    machine could have sent it at the earliest. The file is ``.part`` until complete; when `stop` is set, it ends after
+    the current block and is complete.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be written.
+    """
+    keys, schema_hash = machine.keys, machine.descriptor.schema_hash
+    begin = time.monotonic()
+    summary = RunSummary()
+    first_ns: int | None = None
+    with RecordingWriter(path, overwrite=overwrite) as writer:
+
+        def write(key: str, time_ns: int, payload: bytes, attachment: bytes = b"", form: str = JSON_ENCODING) -> None:
+            writer.write(RecordedMessage(key, payload, attachment, form, time_ns, time_ns))
+
+        for block, truth in stream:
+            if first_ns is None:
+                first_ns = block.start_ns
+                write(keys.descriptor, first_ns, descriptor_payload(machine))
+            for entry in truth:
+                write(keys.truth, entry.time_ns, entry.model_dump_json().encode())
+            write(keys.stream, block.end_ns, *block_message(block, schema_hash, encoding))
+            data_s, latest = (block.end_ns - first_ns) / 1e9, truth[-1] if truth else summary.truth
+            summary = RunSummary(summary.blocks + 1, data_s, time.monotonic() - begin, latest)
+            if on_block is not None:
+                on_block(summary)
+            if stop is not None and stop.is_set():
+                break
+    return summary

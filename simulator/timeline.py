@@ -9,8 +9,10 @@ A ramp becomes a staircase of 0.1 s steps, each at the value of the ramp in the 
                     at_s   at_s + ramp_s
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count, takewhile
 from typing import get_args
 
 from models.machine import Machine
@@ -18,7 +20,6 @@ from models.physics.rotor import PARAMETERS
 from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Rub, Scenario, SensorFault
 
 RAMP_STEP_S = 0.1  # length of the steps a ramp is made of
-_TRUTH_STEP_S = 1.0
 # Active faults of one sensor: kind to value, None where the kind has no value; a swap is "swapped with NAME".
 SensorFaults = Mapping[str, float | None]
 SWAPPED_WITH = "swapped with "  # how the kind of a swap begins
@@ -93,12 +94,10 @@ def _conditions(
 
 def _condition(values: Mapping[_Target, _Values], scenario: Scenario) -> Condition:
     def current(source: NamedSource) -> NamedSource:
-        cutoff_hz, force_rms_N, direction = (
+        (cutoff_hz,), (force_rms_N,), direction = (
             values["source", source.name, field] for field in ("cutoff_hz", "force_rms_N", "direction")
         )
-        return source.model_copy(
-            update={"cutoff_hz": cutoff_hz[0], "force_rms_N": force_rms_N[0], "direction": direction}
-        )
+        return source.model_copy(update={"cutoff_hz": cutoff_hz, "force_rms_N": force_rms_N, "direction": direction})
 
     return Condition(
         relative_changes={name: values["parameter", name][0] for name in PARAMETERS},
@@ -150,13 +149,10 @@ def _by_sample(steps: Mapping[_Target, list[tuple[int, _Values]]]) -> list[tuple
 def _ramp(event: Event, rate_hz: float) -> list[tuple[int, float]]:
     """Sample numbers at which the steps of a change begin, and the fraction of the change reached there."""
     stairs: dict[int, float] = {}
-    begin_s = 0.0
-    number = 0
-    while begin_s < event.ramp_s - 1e-9:
+    begins_s = (number * RAMP_STEP_S for number in count())
+    for begin_s in takewhile(lambda begin_s: begin_s < event.ramp_s - 1e-9, begins_s):
         end_s = min(begin_s + RAMP_STEP_S, event.ramp_s)
         stairs[round((event.at_s + begin_s) * rate_hz)] = (begin_s + end_s) / 2 / event.ramp_s
-        number += 1
-        begin_s = number * RAMP_STEP_S
     stairs[round((event.at_s + event.ramp_s) * rate_hz)] = 1.0
     return list(stairs.items())
 
@@ -197,11 +193,8 @@ def _kind(event: Event) -> str:
 def _truth_times(events: list[Event], rate_hz: float) -> tuple[tuple[int, tuple[str, ...]], ...]:
     due: dict[int, set[str]] = {0: set()}
     for event in events:
-        seconds = 0.0
-        while seconds < event.ramp_s:
+        for seconds in (*range(math.ceil(event.ramp_s)), event.ramp_s):
             due.setdefault(round((event.at_s + seconds) * rate_hz), set())
-            seconds += _TRUTH_STEP_S
-        due.setdefault(round((event.at_s + event.ramp_s) * rate_hz), set())
     for sample, names in due.items():
         names.update(
             _label(event)

@@ -12,13 +12,14 @@ from benchmarks.studies.reporting import opinions as o
 from benchmarks.studies.reporting import results as r
 from benchmarks.studies.reporting.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Study
+from benchmarks.studies.subjects.unusual import Anomaly, Excitation, UnusualDraw
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import detectable_changes, window_thresholds
 from models.diagnosis.verdict.stretch import slope, stretch_of, to_scale
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
-from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
 
 _EXCITATIONS = {
     Excitation.SECOND_ORDER: "as assumed",
@@ -84,7 +85,7 @@ def _measure(trained: o.Trained, seed: int, stream: int, kind: _Kind, _: None, n
     if kind.length_s is not None:
         trained = o.Trained(_with_length(trained.machine, kind.length_s), None)
     machine, faults = trained.machine, kind.faults
-    draw = Draw(
+    draw = UnusualDraw(
         machine, seed, Purpose.EVALUATION, stream, faults=faults,
         layout=kind.layout, excitation=kind.excitation, anomaly=kind.anomaly,
     )  # fmt: skip

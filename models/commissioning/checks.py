@@ -156,10 +156,8 @@ def check_steady(
             slowest, fastest = window.speed_range
             if np.isfinite(slowest) and fastest - slowest > _STEADY_SPEED * window.speed_rad_s:
                 rpm = 30 / np.pi
-                moved.append(
-                    f"{recording.name}: the speed goes from {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm within "
-                    f"{window.duration_s:.3g} s"
-                )
+                speeds = f"{slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
+                moved.append(f"{recording.name}: the speed goes from {speeds} within {window.duration_s:.3g} s")
                 break
         powers = np.array([np.diag(w.as_mounted.correlation[0]) for w in windows[recording.name]])
         powers = np.maximum(powers, 0.0)  # rounding may make the power of a dead channel negative
@@ -169,17 +167,12 @@ def check_steady(
             worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, np.finfo(float).tiny)))))
             if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
                 channel = with_channel_names(windows[recording.name][0].as_mounted.states[worst], machine.sensors)
-                moved.append(
-                    f"{recording.name}: the random vibration of {channel} in the second half is "
-                    f"{round(ratio[worst], 6):.2g} times that of the first"
-                )
+                found = f"is {round(ratio[worst], 6):.2g} times that of the first"
+                moved.append(f"{recording.name}: the random vibration of {channel} in the second half {found}")
     if not moved:
         return told(verdict="passed", text="speed and level are steady within every recording")
-    return told(
-        verdict="refused",
-        text="; ".join(moved),
-        advice="record in steady operation: one file for each speed or load, each of at least two windows",
-    )
+    advice = "record in steady operation: one file for each speed or load, each of at least two windows"
+    return told(verdict="refused", text="; ".join(moved), advice=advice)
 
 
 def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
@@ -228,11 +221,9 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
             advice="the machine was not the same in all of them, or the load alters its bearing: commission on "
             "recordings of one load, or find out what changed",
         )
-    return told(
-        verdict="limited",
-        text=f"{text}; a baseline is kept for each speed, and nothing is evaluated between the speeds",
-        advice="record at more speeds between these if the machine runs there",
-    )
+    text += "; a baseline is kept for each speed, and nothing is evaluated between the speeds"
+    advice = "record at more speeds between these if the machine runs there"
+    return told(verdict="limited", text=text, advice=advice)
 
 
 def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
@@ -269,14 +260,9 @@ def _share_source(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
 
 
 def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Check:
-    """Check whether the recordings determine every relation that the sensors allow.
+    """Check whether the recordings determine every relation that the sensors allow; `reasons` say why not.
 
-    Parameters
-    ----------
-    reasons : sequence of str
-        Why relations are missing, with what to record instead.
-    only_shapes : bool
-        Whether there is no relation at all, so that each channel is only compared with its own healthy shape.
+    With `only_shapes` there is no relation at all: each channel is only compared with its own healthy shape.
     """
     told = partial(Check, name="relations determined")
     if not reasons:
@@ -301,17 +287,12 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
         text = f"noise that makes a channel {seen[least]:.2g} times as loud ({least}) is reported as a changed shape"
     if not blind:
         return told(verdict="passed", text=text)
-    text += (
-        f"; with {windows} healthy windows not even noise that makes {', '.join(blind)} {SEEN_GROWTH:g} times as "
-        "loud is reported"
-    )
+    loud = f"{', '.join(blind)} {SEEN_GROWTH:g} times as loud"
+    text += f"; with {windows} healthy windows not even noise that makes {loud} is reported"
     wanted = max((one.windows or 0 for one in blind.values()), default=0)
     if wanted <= windows:
-        return told(
-            verdict="limited",
-            text=text,
-            advice="set limits for the levels yourself: the healthy signal of these channels is noise-like",
-        )
+        advice = "set limits for the levels yourself: the healthy signal of these channels is noise-like"
+        return told(verdict="limited", text=text, advice=advice)
     advice = (
         f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: with fewer, a window must differ more "
         "from them to be beyond chance"
@@ -327,10 +308,7 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
 def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str | None = None) -> Check:
     """Check whether healthy windows agree with the reference that they were read against.
 
-    Parameters
-    ----------
-    what : str, optional
-        The reference in words, such as "the parameters in the machine file"; by default the other half of the data.
+    `what` is it in words, such as "the parameters in the machine file"; by default it is the other half of the data.
     """
     name, between = "halves agree", "between the halves of the healthy data"
     if what is not None:
@@ -354,9 +332,8 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
     why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
     if named:
         worst = named.most_common(1)[0][0]
-        reading = max(
-            (r for each in readable for r in each.evaluable if r.name == worst), key=lambda r: abs(r.z or 0.0)
-        )
+        readings = [reading for each in readable for reading in each.evaluable if reading.name == worst]
+        reading = max(readings, key=lambda one: abs(one.z or 0.0))
         text = (
             f"{PARAMETER_TEXT[worst]} differs {between}: {reading.relative_change or 0.0:+.1%}, "
             f"{abs(reading.z or 0.0):.1f} standard errors, in {named[worst]} of {len(readable)} windows{why}"

@@ -1,7 +1,7 @@
 """Commission a machine from healthy recordings, with as much physics as its file gives, and report the result."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -124,16 +124,9 @@ def parameter_summaries(
 ) -> tuple[ParameterSummary, ...]:
     """Summarise the readings of each parameter in healthy windows.
 
-    Parameters
-    ----------
-    diagnoses : sequence of (recording, end_ns, Diagnosis)
-        Healthy windows read as later ones will be, with the shared error in each.
-    compared : sequence of (recording, end_ns, Diagnosis)
-        The same windows read against what was learned without them.
-    healthy_s, window_s : float
-        Length of the data learned from, and of the windows in `diagnoses`.
-    identified : mapping of str to float
-        Identified values, SI.
+    `diagnoses` are (recording, end_ns, diagnosis) of windows read as later ones will be, with the shared error in each;
+    `compared` are the same windows read against what was learned without them. `healthy_s` of data were learned from,
+    and the windows in `diagnoses` have `window_s`; identified values are SI.
     """
     settings = SequentialSettings.for_machine(machine)
     threshold = settings.thresholds(settings.window_hops).first + float(ndtri(_POWER))
@@ -142,29 +135,27 @@ def parameter_summaries(
         errors = [_errors(name, diagnosis) for _, _, diagnosis in diagnoses]
         known = [each for each in errors if each is not None]
         if not known:
-            reasons = dict.fromkeys(
-                reading.reason
-                for _, _, diagnosis in diagnoses
-                for reading in diagnosis.parameters
-                if reading.name == name and reading.reason
-            )
+            every = [each for _, _, diagnosis in diagnoses for each in diagnosis.parameters if each.name == name]
+            reasons = dict.fromkeys(each.reason for each in every if each.reason)
             reason = "; ".join(reasons) or "cannot be told without the rotor's own parameters"
             found.append(ParameterSummary(name=name, text=PARAMETER_TEXT[name], evaluable=False, reason=reason))
             continue
         own, shared, elsewhere = (float(np.median(part)) for part in zip(*known, strict=True))
         own *= math.sqrt(window_s / machine.window_data_s)
+        least = threshold * math.hypot(own, shared, elsewhere)
         readings = _readings(name, compared)
+        changes = [one.relative_change for one in readings]
         found.append(
             ParameterSummary(
                 name=name,
                 text=PARAMETER_TEXT[name],
                 evaluable=True,
                 identified=identified.get(name),
-                healthy_spread=_spread(readings),
+                healthy_spread=float(np.std(changes, ddof=1)) if len(changes) > 1 else None,
                 window_error=own,
                 commissioning_error=shared,
-                detectable_loss=max(-1.0, from_scale(name, -threshold * math.hypot(own, shared, elsewhere))),
-                detectable_gain=from_scale(name, threshold * math.hypot(own, shared, elsewhere)),
+                detectable_loss=max(-1.0, from_scale(name, -least)),
+                detectable_gain=from_scale(name, least),
                 wished=wished,
                 readings=readings,
                 **_needed(name, wished, threshold, (own, shared, elsewhere), healthy_s, machine.window_data_s),
@@ -205,10 +196,6 @@ def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float, float] | Non
     return own / factor, math.sqrt(shared - elsewhere) / factor, math.sqrt(elsewhere) / factor
 
 
-def _spread(readings: Sequence[HealthyReading]) -> float | None:
-    return float(np.std([one.relative_change for one in readings], ddof=1)) if len(readings) > 1 else None
-
-
 def _readings(name: str, compared: Sequence[tuple[str, int, Diagnosis]]) -> tuple[HealthyReading, ...]:
     return tuple(
         HealthyReading(
@@ -242,14 +229,9 @@ def commission(
     why: str = "",
     progress: Progress = lambda *_: None,
 ) -> Commissioning:
-    """Commission a machine.
+    """Commission a machine from recordings of one steady condition each.
 
-    Parameters
-    ----------
-    recordings : sequence of HealthyRecording
-        One for each file, each of one steady condition.
-    wished : float, optional
-        Relative change that is to be found; by default the alarm limit.
+    `wished` is the relative change that is to be found, by default the alarm limit.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
@@ -258,9 +240,7 @@ def commission(
         checks, pieces = [*checks, unsuited], []
     learned, states = Learned(()), states_of(machine)
     if pieces:
-        by_recording = {
-            one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
-        }
+        by_recording = {one.name: [each.window for each in pieces if each.recording == one.name] for one in recordings}
         findings = {
             name: [
                 fault
@@ -316,9 +296,8 @@ def commission(
                 known_lines(recordings),
             ),
         )
-    return Commissioning(
-        _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine
-    )
+    report = _report(machine, recordings, checks, learned, commissioned, pieces, wished)
+    return Commissioning(report, commissioned, learned.machine)
 
 
 def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple[KnownLine, ...]:
@@ -370,9 +349,12 @@ def _report(
         if learned.diagnoses
         else ()
     )
-    verdict = "refused" if commissioned is None else "commissioned"
-    if commissioned is not None and any(check.verdict == "limited" for check in checks):
-        verdict = "limited"
+    verdict = "refused"
+    growths: Iterable[GrowthToAlert] = ()
+    if commissioned is not None:
+        verdict = "limited" if any(check.verdict == "limited" for check in checks) else "commissioned"
+        if commissioned.levels is not None and machine.levels.reference != "first windows":
+            growths = alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops)
     return CommissioningReport.model_validate(
         {
             "site": machine.site,
@@ -380,7 +362,7 @@ def _report(
             "level": knowledge.level,
             "level_text": knowledge.text,
             "verdict": verdict,
-            "summary": _summary(verdict, checks, _readable(machine, [one.name for one in parameters if one.evaluable])),
+            "summary": _summary(machine, verdict, checks, [one.name for one in parameters if one.evaluable]),
             "version": 0 if commissioned is None else commissioned.version,
             "identity": None if commissioned is None else commissioned.identity,
             "healthy_s": healthy_s,
@@ -390,7 +372,7 @@ def _report(
             "equations": _equations(machine, learned, pieces),
             "parameters": parameters,
             "conditions": None if commissioned is None else commissioned.conditions,
-            "levels": _growths(machine, commissioned),
+            "levels": tuple(growths),
             "notes": (*learned.notes, *_misfit_notes(commissioned)),
         }
     )
@@ -420,27 +402,15 @@ def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
     )
 
 
-def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[GrowthToAlert, ...]:
-    """Growth of each level that raises an alert; empty if limits refer to the first windows instead."""
-    if commissioned is None or commissioned.levels is None or machine.levels.reference == "first windows":
-        return ()
-    return tuple(alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops))
-
-
-def _readable(machine: MachineFile, evaluable: Sequence[str]) -> str:
-    if evaluable:
-        return f"changes of {', '.join(evaluable)} can be read"
-    return "it can only be told whether a channel has changed" if states_of(machine) else "only levels are compared"
-
-
-def _summary(verdict: str, checks: Sequence[Check], read: str) -> str:
-    told = {each: [check for check in checks if check.verdict == each] for each in ("refused", "limited")}
+def _summary(machine: MachineFile, verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) -> str:
+    refused, limited = ([check for check in checks if check.verdict == each] for each in ("refused", "limited"))
     if verdict == "refused":
-        reasons = told["refused"] or told["limited"]
-        return "; ".join(f"{check.text}; advice: {check.advice}" for check in reasons) or "nothing could be learned"
-    if verdict == "limited":
-        return f"{read}; limited by: {'; '.join(check.text for check in told['limited'])}"
-    return read
+        reasons = (f"{check.text}; advice: {check.advice}" for check in refused or limited)
+        return "; ".join(reasons) or "nothing could be learned"
+    read = "it can only be told whether a channel has changed" if states_of(machine) else "only levels are compared"
+    if evaluable:
+        read = f"changes of {', '.join(evaluable)} can be read"
+    return f"{read}; limited by: {'; '.join(check.text for check in limited)}" if verdict == "limited" else read
 
 
 def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[HealthyPiece]) -> tuple[EquationRow, ...]:

@@ -68,39 +68,33 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
     >>> knowledge_of(load_machine_file("lab")).level.value
     'full'
     """
-    rotor = machine.rotor
+    rotor, level = machine.rotor, KnowledgeLevel.NONE
     if not states_of(machine):
         lacks = "no channel is at bearing or disc, in y or z" if machine.holds_band else "snapshots are too short"
-        return Knowledge(KnowledgeLevel.NONE, f"{lacks}: vibration levels are learned, and nothing is diagnosed")
-    if isinstance(machine, Machine):
-        return Knowledge(KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor")
-    if rotor is None:
-        learned = ": everything is learned from the recordings"
+        text = f"{lacks}: vibration levels are learned, and nothing is diagnosed"
+    elif isinstance(machine, Machine):
+        level, text = KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor"
+    elif rotor is None:
+        text = "the machine file has no [rotor]: everything is learned from the recordings"
         if all(reason for _, reason in evaluable_rows(states_of(machine), has_phase_reference=True)):
-            learned = (
-                ", and these sensors allow no equation: no part is diagnosed, each channel is only compared with its "
-                "own healthy form"
+            text = (
+                "the machine file has no [rotor], and these sensors allow no equation: no part is diagnosed, each "
+                "channel is only compared with its own healthy form"
             )
-        return Knowledge(KnowledgeLevel.NONE, f"the machine file has no [rotor]{learned}")
-    lacking = [name for name in _GEOMETRY if name in rotor.unknown]
-    if lacking:
-        return Knowledge(
-            KnowledgeLevel.NONE,
-            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft it cannot be used at all, and "
-            "everything is learned from the recordings",
+    elif lacking := [name for name in _GEOMETRY if name in rotor.unknown]:
+        without = "without masses and shaft it cannot be used at all"
+        text = f"[rotor] lacks {', '.join(lacking)}: {without}, and everything is learned from the recordings"
+    elif rotor.unknown:
+        level, names = KnowledgeLevel.PARTIAL, ", ".join(rotor.unknown)
+        text = f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: {names}"
+    else:
+        tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
+        level = KnowledgeLevel.PARTIAL
+        text = (
+            f"[rotor] is complete, but without {' and '.join(tables)} nothing can be simulated: stiffness, damping and "
+            "unbalance are identified from the recordings"
         )
-    tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
-    if rotor.unknown:
-        return Knowledge(
-            KnowledgeLevel.PARTIAL,
-            f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: "
-            f"{', '.join(rotor.unknown)}",
-        )
-    return Knowledge(
-        KnowledgeLevel.PARTIAL,
-        f"[rotor] is complete, but without {' and '.join(tables)} nothing can be simulated: stiffness, damping and "
-        "unbalance are identified from the recordings",
-    )
+    return Knowledge(level, text)
 
 
 _RPM = 30 / np.pi
@@ -133,13 +127,9 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
         """Range of healthy windows."""
         speeds = [window.speed_rad_s * _RPM for window in windows if np.isfinite(window.speed_rad_s)]
         rms = np.array([_rms(window) for window in windows])
-        return cls(
-            speed_rpm=(min(speeds), max(speeds)) if speeds else None,
-            rms={
-                name: (float(low), float(high))
-                for name, low, high in zip(windows[0].states, rms.min(axis=0), rms.max(axis=0), strict=True)
-            },
-        )
+        ranges = zip(rms.min(axis=0).tolist(), rms.max(axis=0).tolist(), strict=True)
+        of_states = dict(zip(windows[0].states, ranges, strict=True))
+        return cls(speed_rpm=(min(speeds), max(speeds)) if speeds else None, rms=of_states)
 
     def outside(self, window: WindowStatistics, naming: Naming) -> str:
         """Why a window is outside the commissioned conditions; empty if it is inside."""
@@ -155,10 +145,8 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             low, high = self.rms[name]
             if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
                 found, least, most = (naming.value(name, each) for each in (value, low, high))
-                return (
-                    f"random vibration of {naming.name(name)} is {found} rms, commissioned at {least} to {most}, and "
-                    f"up to {LEVEL_MARGIN:g} times less or more"
-                )
+                seen = f"{least} to {most}, and up to {LEVEL_MARGIN:g} times less or more"
+                return f"random vibration of {naming.name(name)} is {found} rms, commissioned at {seen}"
         return ""
 
 
@@ -169,8 +157,6 @@ def _rms(window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.float64
 FILE = "commissioned.json"
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition", "schedule"}
-
-
 Gyroscopic = Literal["Eq. 27", "opposite"]
 
 
@@ -294,10 +280,7 @@ def described(machine: MachineFile) -> dict[str, Any]:
 def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:
     """Load a commissioned bundle and check that it belongs to a machine.
 
-    Parameters
-    ----------
-    same_description : bool
-        Whether channels, window and physics must be the same as when it was commissioned.
+    With `same_description`, channels, window and physics must be the same as when it was commissioned.
 
     Raises
     ------
@@ -373,10 +356,7 @@ class Installed:
 def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     """Load what a machine is monitored with; if it is neither known nor commissioned, only its levels are watched.
 
-    Parameters
-    ----------
-    bundle : str or Path, optional
-        Shipped bundle by name, or directory of a trained or commissioned one.
+    The bundle is a shipped one by its name, or the directory of a trained or commissioned one.
 
     Raises
     ------

@@ -81,17 +81,9 @@ def healthy_from_blocks(
             if hop is not None:
                 stretches[-1].append(hop)
     running = [part for stretch in stretches for part in _without_stops(plan, stretch)]
-    stopped = sum(map(len, stretches)) - sum(map(len, running))
-    return HealthyRecording(
-        name,
-        plan,
-        tuple(tuple(part) for part in running if part),
-        gaps,
-        missing_s,
-        tuple(sorted(refused.items())),
-        last_refusal,
-        stopped * plan.fresh / plan.rate_hz,
-    )
+    kept, counts = tuple(tuple(part) for part in running if part), tuple(sorted(refused.items()))
+    stopped_s = (sum(map(len, stretches)) - sum(map(len, running))) * plan.fresh / plan.rate_hz
+    return HealthyRecording(name, plan, kept, gaps, missing_s, counts, last_refusal, stopped_s)
 
 
 def _without_stops(plan: Plan, stretch: list[HopMoments]) -> list[list[HopMoments]]:
@@ -127,10 +119,8 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
     if not found.hops and not found.refused:
         streams = [key for key in summarize_recording(path).messages if key.endswith("/stream")]
-        raise RecordingError(
-            f"{path}: no hop of {machine.hop_data_s:g} s of {machine.title} in it; it holds "
-            f"{', '.join(streams) or 'no stream'}"
-        )
+        held = ", ".join(streams) or "no stream"
+        raise RecordingError(f"{path}: no hop of {machine.hop_data_s:g} s of {machine.title} in it; it holds {held}")
     return found
 
 

@@ -58,10 +58,7 @@ def identify(
 ) -> Identified:
     """Identify stiffness, damping and unbalance, given masses and shaft, in healthy windows that do not overlap.
 
-    Parameters
-    ----------
-    sized : bool
-        Whether the size of the unbalance is identified if there is no shaft angle.
+    With `sized`, the size of the unbalance is identified if there is no shaft angle.
 
     Raises
     ------
@@ -126,13 +123,7 @@ def has_angle(windows: Sequence[WindowStatistics]) -> bool:
 
 
 def _size(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> tuple[float, float]:
-    """Size of the unbalance over the nominal one, and the relative variance of the size in a later window.
-
-    Raises
-    ------
-    EstimationError
-        If it is not read in all windows, or differs between them.
-    """
+    """Size of the unbalance over the nominal one, and the relative variance of the size in a later window."""
     read = [reading for each in diagnoses for reading in each.evaluable if reading.name == "e"]
     sizes = np.array([1 + (reading.relative_change or 0.0) for reading in read])
     variances = np.array([(reading.standard_error or 0.0) ** 2 for reading in read])
@@ -184,15 +175,11 @@ def _moved(
     parts = weights @ np.array([(one.real, one.imaginary) for one in vectors]) / weights.sum()
     size, turned = math.hypot(*parts), math.atan2(parts[1], parts[0])
     phase = math.remainder(moved.operation.unbalance_phase_rad + turned, 2 * math.pi)
-    balanced = moved.model_copy(
-        update={
-            "rotor": moved.rotor.model_copy(update={"e_m": moved.rotor.e_m * size}),
-            "operation": moved.operation.model_copy(update={"unbalance_phase_rad": phase}),
-        }
-    )
-    return balanced, [
-        fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in zip(read, windows, strict=True)
-    ]
+    rotor = moved.rotor.model_copy(update={"e_m": moved.rotor.e_m * size})
+    operation = moved.operation.model_copy(update={"unbalance_phase_rad": phase})
+    balanced = moved.model_copy(update={"rotor": rotor, "operation": operation})
+    pairs = zip(read, windows, strict=True)
+    return balanced, [fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in pairs]
 
 
 def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:
@@ -202,14 +189,12 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
         raise MachineFileError(f"{machine.title}: [rotor] gives no masses")
     speeds = [window.speed_rad_s for window in windows if np.isfinite(window.speed_rad_s)]
     if machine.operation is None and not speeds:
-        raise MachineFileError(
-            f"{machine.title}: the recordings have no phase reference: give speed_rpm in [operation]"
-        )
+        why = "the recordings have no phase reference: give speed_rpm in [operation]"
+        raise MachineFileError(f"{machine.title}: {why}")
     speed = machine.operation.speed_rad_s if machine.operation is not None else float(np.median(speeds))
     spread = max((abs(one / speed - 1) for one in speeds), default=0.0)
-    operation = machine.operation or Operation(
-        speed_rpm=speed * 30 / math.pi, speed_tolerance=max(_LEAST_TOLERANCE, 1.5 * spread)
-    )
+    tolerance = max(_LEAST_TOLERANCE, 1.5 * spread)
+    operation = machine.operation or Operation(speed_rpm=speed * 30 / math.pi, speed_tolerance=tolerance)
     guesses = {"e_m": _first_e(windows), **_from_forces(known.m2_kg, windows)}
     given: dict[str, float] = known.model_dump(exclude_none=True)
     if "k_by_N_per_m" not in guesses or "k_bz_N_per_m" not in guesses:
@@ -219,12 +204,9 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
         k = fields[f"k_b{axis}_N_per_m"]
         fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * _START_DAMPING * math.sqrt(k * (known.m1_kg + known.m2_kg)))
     low_hz, high_hz = (edge / machine.time_scale for edge in _CUTOFF_HZ)
-    described = machine.model_dump() | {
-        "rotor": RotorParameters.model_validate(fields),
-        "operation": operation,
-        "condition": machine.condition or ConditionRange(cutoff_hz=(low_hz, high_hz)),
-    }
-    return Machine.model_validate(described)
+    condition = machine.condition or ConditionRange(cutoff_hz=(low_hz, high_hz))
+    tables = {"rotor": RotorParameters.model_validate(fields), "operation": operation, "condition": condition}
+    return Machine.model_validate(machine.model_dump() | tables)
 
 
 def _first_e(windows: Sequence[WindowStatistics]) -> float:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from types import MappingProxyType
 from typing import get_args
 
 import numpy as np
@@ -54,7 +53,6 @@ from models.signals.channels import ACCELERATIONS
 
 Read = tuple[str, int, Diagnosis]  # recording, end of the window in ns, and its diagnosis
 Progress = Callable[[str, int, int], None]  # called with the present step in words, the steps done, and their total
-_TABLES = ("rotor", "operation", "condition")
 _SIZE = 0.05  # relative difference in size up to which the unbalance is that of the file, turned to another angle
 _OPPOSITE = (
     "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
@@ -94,60 +92,64 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[HealthyPiece]:
     for recording in recordings:
         plan = recording.plan
         for stretch in recording.stretches:
-            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
             if len(stretch) < _SHORTEST_HOPS:
                 continue
+            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
             cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
             parts = [stretch[a:b] for a, b in pairwise(cuts.tolist())]
-            windows = [window_statistics(plan, part, lines=None) for part in parts]
-            found += [
-                HealthyPiece(recording.name, 2 * number >= count, window, levels_of(plan, part))
-                for number, (window, part) in enumerate(zip(windows, parts, strict=True))
-            ]
+            for number, part in enumerate(parts):
+                window, levels = window_statistics(plan, part, lines=None), levels_of(plan, part)
+                found.append(HealthyPiece(recording.name, 2 * number >= count, window, levels))
     return found
 
 
-def _by_theory(
-    machine: MachineFile, pieces: Sequence[HealthyPiece], identified: Callable[..., Identified]
-) -> tuple[Identified, tuple[Read, ...], IdentifiedRecord | None]:
+NO_SUCH_ROTOR = (
+    "if the machine is not one bearing and an overhung disc, leave [rotor] out of the machine file: it is then "
+    "compared with its own healthy windows"
+)
+
+
+def _learn_by_theory(
+    machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic
+) -> Learned:
     """Read the windows with the theory; without a shaft angle, identify the unbalance's size if all windows agree."""
+    windows = [piece.window for piece in pieces]
+    read_by: Callable[..., Identified]
+    if isinstance(machine, Machine):
+        read_by = partial(compare, machine, windows, partial(progress, "comparing with theory"), sense)
+        what = "the parameters in the machine file"
+    else:
+        read_by = partial(identify, machine, windows, partial(progress, "identifying the rotor"), sense)
+        what = "the identified rotor"
     try:
-        found = identified(sized=True)
+        found = read_by(sized=True)
     except EstimationError:
-        if has_angle([piece.window for piece in pieces]):
+        if has_angle(windows):
             raise
-        found = identified(sized=False)
-    stated = [
-        determined(diagnosis, piece.window, machine.window_data_s)
-        for piece, diagnosis in zip(pieces, found.diagnoses, strict=True)
-    ]
+        found = read_by(sized=False)
+    pairs = zip(windows, found.diagnoses, strict=True)
+    stated = [determined(diagnosis, window, machine.window_data_s) for window, diagnosis in pairs]
     record = None
     if found.names:
         stated = [with_shared_error(each, found.covariance) for each in stated]
-        record = IdentifiedRecord(
-            machine=found.machine.model_dump(mode="json", include=set(_TABLES)),
-            names=found.names,
-            covariance=tuple(tuple(row) for row in found.covariance.tolist()),
-        )
-    read = ((piece.recording, piece.window.end_ns, each) for piece, each in zip(pieces, stated, strict=True))
-    return found, tuple(read), record
-
-
-def _learn_full(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic) -> Learned:
-    assert isinstance(machine, Machine)  # noqa: S101  # the level says so
-    windows = [piece.window for piece in pieces]
-    read_by = partial(compare, machine, windows, partial(progress, "comparing with theory"), sense)
-    found, read, record = _by_theory(machine, pieces, read_by)
-    check = check_agreement(machine, [each for _, _, each in read], "the parameters in the machine file")
+        tables = found.machine.model_dump(mode="json", include={"rotor", "operation", "condition"})
+        covariance = tuple(map(tuple, found.covariance.tolist()))
+        record = IdentifiedRecord(machine=tables, names=found.names, covariance=covariance)
+    check = check_agreement(machine, stated, what)
     if check.verdict == "refused":
-        check = check.model_copy(
-            update={
-                "advice": _turned_unbalance_advice(machine, [each for _, _, each in read])
-                or "the file does not describe the machine that was recorded: correct it, or leave "
+        advice = f"{check.advice}; {NO_SUCH_ROTOR}"
+        if isinstance(machine, Machine):
+            advice = _turned_unbalance_advice(machine, stated) or (
+                "the file does not describe the machine that was recorded: correct it, or leave "
                 "out of [rotor] what is not known for certain, so that it is identified"
-            }
-        )
-    return Learned((check,), read, read, found.machine, record, sense, notes=_integrated(pieces, machine))
+            )
+        check = check.model_copy(update={"advice": advice})
+    notes: tuple[str, ...] = ()
+    if any(name in ACCELERATIONS for name in windows[0].states):
+        low, high = machine.window.band_hz
+        notes = (f"Accelerations are integrated to velocities in the spectrum, valid from {low:g} to {high:g} Hz.",)
+    read = tuple((piece.recording, piece.window.end_ns, each) for piece, each in zip(pieces, stated, strict=True))
+    return Learned((check,), read, read, found.machine, record, sense, notes=notes)
 
 
 def _turned_unbalance_advice(machine: Machine, read: Sequence[Diagnosis]) -> str:
@@ -165,25 +167,6 @@ def _turned_unbalance_advice(machine: Machine, read: Sequence[Diagnosis]) -> str
     )
 
 
-NO_SUCH_ROTOR = (
-    "if the machine is not one bearing and an overhung disc, leave [rotor] out of the machine file: it is then "
-    "compared with its own healthy windows"
-)
-
-
-def _learn_partial(
-    machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress, sense: Gyroscopic
-) -> Learned:
-    windows = [piece.window for piece in pieces]
-    read_by = partial(identify, machine, windows, partial(progress, "identifying the rotor"), sense)
-    identified, read, record = _by_theory(machine, pieces, read_by)
-    check = check_agreement(machine, [each for _, _, each in read], "the identified rotor")
-    if check.verdict == "refused":
-        check = check.model_copy(update={"advice": f"{check.advice}; {NO_SUCH_ROTOR}"})
-    notes = _integrated(pieces, identified.machine)
-    return Learned((check,), read, read, identified.machine, record, sense, notes=notes)
-
-
 def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
     longest_s = LONGEST_LAG_STEP_S * machine.time_scale
@@ -191,30 +174,34 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     if wrong and not too_slow:
         advice = "change lag_step_s, lag_to_s or length_s in [window] of the machine file; the recordings can stay"
         return Learned((Check(name="window settings", verdict="refused", text=wrong, advice=advice),))
+    shape, no_shape = None, ""
     try:
         shape = learn_shape(windows)
-        no_shape = ""
     except EstimationError as error:
-        shape, no_shape = None, str(error)
-    evaluable = [
-        row
-        for row, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))
-        if not reason
-    ]
+        no_shape = str(error)
+    why = advice = ""
     if too_slow:
         why = f"a sampling rate of {machine.rate_hz:g} Hz allows no equation"
-        least_hz = math.ceil(1 / longest_s)
-        return _without_equations(machine, shape, no_shape, why, f"sample at {least_hz} Hz or faster")
-    if not evaluable:
-        return _without_equations(machine, shape, no_shape)
-    try:
-        return replace(_with_relations(machine, pieces, progress), shape=shape)
-    except EstimationError as error:
+        advice = f"sample at {math.ceil(1 / longest_s)} Hz or faster"
+    elif all(reason for _, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))):
+        why = "these sensors allow no equation"
+        sensors = "a displacement, velocity or acceleration at the bearing and at the disc in that plane"
+        advice = f"for the bearing in one plane: {sensors}"
+    if why:
         if shape is None:
-            raise
-        powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
-        checks = (check_determined([str(error)], only_shapes=True), check_shapes(machine, powers, shape.windows))
-        return Learned(checks, shape=shape)
+            check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
+            return Learned((check,))
+        text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
+        check = Check(name="equations", verdict="limited", text=text, advice=advice)
+    else:
+        try:
+            return replace(_with_relations(machine, pieces, progress), shape=shape)
+        except EstimationError as error:
+            if shape is None:
+                raise
+            check = check_determined([str(error)], only_shapes=True)
+    powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
+    return Learned((check, check_shapes(machine, powers, shape.windows)), shape=shape)
 
 
 _LINEAR = (
@@ -243,32 +230,21 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
         compared += _read_across_halves(group, baseline.rows)
     halves = check_agreement(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
-    sources = check_sources(
-        {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
-    )
+    names = dict.fromkeys(piece.recording for piece in pieces)
+    sources = check_sources({name: [each.window for each in pieces if each.recording == name] for name in names})
     band = _differentiated(baselines[0], machine)
     checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
-    return Learned(
-        checks,
-        tuple(read),
-        tuple(compared),
-        notes=(band, _LINEAR),
-        baselines=tuple(
-            ConditionBaseline(
-                conditions=OperatingRange.of([piece.window for piece in group]), baseline=BaselineRecord.of(baseline)
-            )
-            for group, baseline in zip(groups, baselines, strict=True)
-        ),
-    )
+    records = []
+    for group, baseline in zip(groups, baselines, strict=True):
+        conditions = OperatingRange.of([piece.window for piece in group])
+        records.append(ConditionBaseline(conditions=conditions, baseline=BaselineRecord.of(baseline)))
+    return Learned(checks, tuple(read), tuple(compared), baselines=tuple(records), notes=(band, _LINEAR))
 
 
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
     """Learn a baseline from healthy windows that do not overlap, without relations that they hardly determine.
 
-    Parameters
-    ----------
-    conditions : sequence of str
-        Condition of each window, for example its recording.
+    Each window has a condition, for example its recording.
 
     Raises
     ------
@@ -291,24 +267,14 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
 
 def _differentiated(baseline: Baseline, machine: MachineFile) -> str:
     """Sentence on the frequency up to which derivatives of the measured motions are valid."""
-    deepest = max(
-        formation_of([term.motions for term in row.terms], relation.states).deepest
-        for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
-        if relation is not None
-    )
+    pairs = zip(learned_rows(baseline.rows), baseline.relations, strict=True)
+    known = [(row.terms, relation.states) for row, relation in pairs if relation is not None]
+    deepest = max(formation_of([term.motions for term in terms], states).deepest for terms, states in known)
     edge = passband_hz(deepest, machine.window.band_hz[1], machine.time_scale)
     return (
         f"What is not measured is derived: up to {deepest} derivatives are taken of the correlation functions under "
         f"smooth kernels, valid from 0 to {edge:.0f} Hz; higher frequencies hardly count."
     )
-
-
-def _integrated(pieces: Sequence[HealthyPiece], machine: Machine) -> tuple[str, ...]:
-    """Sentence on the use of accelerations; empty if none is measured."""
-    if not any(name in ACCELERATIONS for name in pieces[0].window.states):
-        return ()
-    low, high = machine.window.band_hz
-    return (f"Accelerations are integrated to velocities in the spectrum, valid from {low:g} to {high:g} Hz.",)
 
 
 def _baseline(pieces: Sequence[HealthyPiece]) -> Baseline:
@@ -336,23 +302,6 @@ def _by_speed(pieces: Sequence[HealthyPiece]) -> list[list[HealthyPiece]]:
     return groups
 
 
-def _without_equations(
-    machine: MachineFile,
-    shape: HealthyShape | None,
-    no_shape: str,
-    why: str = "these sensors allow no equation",
-    advice: str = "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the "
-    "disc in that plane",
-) -> Learned:
-    if shape is None:
-        check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
-        return Learned((check,))
-    text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
-    powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
-    equations = Check(name="equations", verdict="limited", text=text, advice=advice)
-    return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)
-
-
 def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
     """Every window, read against a baseline learned on the other halves of the recordings."""
     found: list[Read] = []
@@ -370,9 +319,6 @@ def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> 
     return tuple(sorted(found, key=lambda read: read[1]))
 
 
-_OF_LEVEL = MappingProxyType({KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial})
-
-
 def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress) -> Learned:
     """Learn from the windows at a knowledge level.
 
@@ -384,7 +330,7 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
     errors: list[EstimationError] = []
     for sense in get_args(Gyroscopic):
         try:
-            found.append(_OF_LEVEL[level](machine, pieces, progress, sense))
+            found.append(_learn_by_theory(machine, pieces, progress, sense))
         except EstimationError as error:
             errors.append(error)
             continue

@@ -72,14 +72,10 @@ def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
     """Learn the reference of one channel from healthy windows."""
     rms = np.stack([one.rms[:, column] for one in windows])
     errors = np.stack([one.errors[:, column] for one in windows if one.errors is not None])
-    return BandReference(
-        edges_hz=_short(windows[0].edges_hz),
-        mean=_short(rms.mean(axis=0)),
-        high=_short(rms.max(axis=0)),
-        low=_short(rms.min(axis=0)),
-        error=_short(errors.mean(axis=0)),
-        freedom=_short(np.asarray(sum(one.freedom for one in windows))),
-    )
+    edges_hz, freedom = _short(windows[0].edges_hz), _short(np.asarray(sum(one.freedom for one in windows)))
+    mean, high, low = _short(rms.mean(axis=0)), _short(rms.max(axis=0)), _short(rms.min(axis=0))
+    error = _short(errors.mean(axis=0))
+    return BandReference(edges_hz=edges_hz, mean=mean, high=high, low=low, error=error, freedom=freedom)
 
 
 def _short(values: FloatArray) -> tuple[float, ...]:
@@ -113,16 +109,8 @@ def band_limits(
     The ratio of the mean squares of two stretches of Gaussian noise follows an F distribution (J. S. Bendat, A. G.
     Piersol, "Random Data", 4th ed., chapter 4): no limit is nearer than what chance exceeds once in 10⁹ bands.
 
-    Parameters
-    ----------
-    levels : BandLevels
-        Of a window of the length in question.
-    references : sequence of BandReference or None
-        By column.
-    ratio : float
-        Least limit over the mean of the reference.
-    shorter : float
-        Factor by which a level scatters more than in the healthy windows, while the window fills.
+    Levels are those of a window of the length in question, references are by column. `ratio` is the least limit over
+    the mean of the reference; a level scatters `shorter` times as much as in the healthy windows while a window fills.
     """
     own, mean, limit = np.zeros((3, *levels.rms.shape))
     for column, reference in enumerate(references):
@@ -135,9 +123,8 @@ def band_limits(
         relative = ERRORS * np.divide(error, around, out=np.zeros_like(around), where=around > 0)
         loudest = np.maximum(BEYOND_RANGE, 1 + relative * np.sqrt(shorter**2 - 1)) * high
         own[:, column], mean[:, column] = reference.mean, around
-        limit[:, column] = np.max(
-            [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around], axis=0
-        )
+        least = [np.maximum(ratio, chance) * around, loudest, (1 + relative * shorter) * around]
+        limit[:, column] = np.max(least, axis=0)
     return BandLimits(own, mean, limit)
 
 

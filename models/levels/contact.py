@@ -38,7 +38,6 @@ _STEPS = 20.0
 *heavy*, steps of rms/12 to rms/7 gave 4.3 standard errors in an average hop, steps half that size none."""
 _NOTHING = 1e-6
 """Fraction of the largest deviation below which a value is rounding error."""
-_Hop = npt.NDArray[np.float32]  # written with every hop
 _PER_TURN, _LEAST_HZ = 48, 1000.0
 """Samples per turn, and Hz: sampled at twice both or more, neighbours are averaged, as no force moves the shaft much
 between them. Without averaging, a healthy rotor with 117 samples a turn and 2 % noise gave one standard error a hop."""
@@ -121,7 +120,7 @@ class LatestContact:
     """Contact statistics of the latest hops, more than a window has: a light contact takes minutes to stand out."""
 
     def __init__(self, hops: int) -> None:
-        self._hops: deque[_Hop] = deque(maxlen=hops)
+        self._hops: deque[npt.NDArray[np.float32]] = deque(maxlen=hops)  # written with every hop
         self._state = 0
 
     def take(self, hop: FloatArray, state: int) -> FloatArray:
@@ -138,15 +137,7 @@ class LatestContact:
         return {"contact": hops, "contact_state": np.array(self._state, dtype=np.int64)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
-        hops, state = (
-            checked(arrays, "contact", np.float32, (None, None)),
-            checked(arrays, "contact_state", np.int64, ()),
-        )
-        self._hops, self._state = deque(hops, self._hops.maxlen), int(state)
+        """Go on where `checkpoint` was called; `CheckpointError` if an array is missing or of another form."""
+        hops = checked(arrays, "contact", np.float32, (None, None))
+        self._state = int(checked(arrays, "contact_state", np.int64, ()))
+        self._hops = deque(hops, self._hops.maxlen)

@@ -63,13 +63,10 @@ def learn_gains(places: Sequence[str], recordings: Sequence[Sequence[BandLevels]
     every = [np.array([_levels(one, places)[counts] for one in recording]) for recording in recordings]
     within = np.concatenate([_contrast(own - own.mean(axis=0)) for own in every])
     scatter = np.sqrt((within**2).sum(axis=0) / freedom)
-    return GainReference(
-        places=names,
-        edges_hz=tuple(_edges(windows[0])[counts].tolist()),
-        levels=tuple(tuple(map(tuple, own.mean(axis=0).round(4).tolist())) for own in every),
-        scatter=tuple(map(tuple, scatter.round(5).tolist())),
-        windows=min(map(len, every)),
-    )
+    levels = tuple(tuple(map(tuple, own.mean(axis=0).round(4).tolist())) for own in every)
+    edges_hz, spread = tuple(_edges(windows[0])[counts].tolist()), tuple(map(tuple, scatter.round(5).tolist()))
+    fewest = min(map(len, every))
+    return GainReference(places=names, edges_hz=edges_hz, levels=levels, scatter=spread, windows=fewest)
 
 
 def wrong_gain(levels: BandLevels, places: Sequence[str], reference: GainReference) -> tuple[str, float] | None:
@@ -101,12 +98,8 @@ def left_of_1x(logs: FloatArray, errors: FloatArray, places: Sequence[str], plac
     """Change of 1x that a wrong gain of a place leaves unexplained: chi-square less its degrees of freedom, 0 at least.
 
     A gain changes 1x at its own place only, by its factor. A factor common to all places is an unbalance, and is not
-    counted. A changed bearing changes 1x at the other places too.
-
-    Parameters
-    ----------
-    logs, errors : ndarray, shape (n_channels,)
-        Logarithm of 1x over that of the healthy machine, and its standard error.
+    counted. A changed bearing changes 1x at the other places too. For each channel, `logs` has the logarithm of 1x over
+    that of the healthy machine, and `errors` its standard error.
     """
     names = tuple(dict.fromkeys(places))
     own = np.array([[one == name for one in places] for name in names]) / [[places.count(name)] for name in names]
@@ -129,9 +122,8 @@ def _edges(levels: BandLevels) -> FloatArray:
 
 def _thirds(rms: FloatArray) -> FloatArray:
     count = len(rms) // _PER_THIRD
-    return np.asarray(
-        np.sqrt((rms[: count * _PER_THIRD] ** 2).reshape(count, _PER_THIRD, -1).sum(axis=1)), dtype=np.float64
-    )
+    thirds = (rms[: count * _PER_THIRD] ** 2).reshape(count, _PER_THIRD, -1)
+    return np.asarray(np.sqrt(thirds.sum(axis=1)), dtype=np.float64)
 
 
 def _levels(levels: BandLevels, places: Sequence[str]) -> FloatArray:

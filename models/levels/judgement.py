@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
+from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from models.levels.limits import (
     Limit,
     RelativeLimits,
     all_rounded,
+    finite,
     relative_limits,
     rounded,
     shown_level,
@@ -30,9 +32,8 @@ from models.levels.limits import (
 from models.levels.lines import new_line
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState
-from models.levels.settings import LevelSettings
+from models.levels.settings import ZONES, LevelSettings, zone_of
 from models.levels.wiring import rewired
-from models.levels.zones import ZONES, zone_of
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
@@ -49,8 +50,6 @@ _ERRORS_OF_DOUBT = 4.0
 _X1_VECTOR = "1x vector"
 _MOST_KEPT = 16  # sets of limits kept per channel: for its zones, operating states, lengths of a window that fills
 _DEADBAND = 0.9
-
-
 _MEASURED = tuple(name for name in LEVEL_MEASURES if name != "growth")
 _SHOWN = (*_MEASURED, "growth", "x1_phase_lag_deg", "x2_phase_lag_deg")
 _ROW = {name: row for row, name in enumerate(_SHOWN)}
@@ -62,9 +61,9 @@ _Standard = tuple[str, str, tuple[float, float, float]]
 class _Nearest:
     """The nearest limits of a level, and the record of a level that is within all of them."""
 
-    alert: Limit | None
-    danger: Limit | None
-    fall: Limit | None
+    alert: Limit
+    danger: Limit
+    fall: Limit
     normal: LevelLimits
     # The level is within its limits from `low` to below `high`.
     low: float
@@ -94,7 +93,9 @@ class LevelJudge:
         # Caches of what most windows have in common with the one before.
         self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}
         self._limits: dict[tuple[object, ...], dict[str, _Nearest]] = {}
-        self._growth = lru_cache(maxsize=16 * len(self._channels))(_growth_limit)
+        self._growth = lru_cache(maxsize=16 * len(self._channels))(
+            lambda source, alert: _nearest_limits("growth", [Limit(source, False, alert)])
+        )
 
     def judge(
         self,
@@ -108,8 +109,7 @@ class LevelJudge:
 
         If lines `moved` to other bands within the window, there is no growth.
         """
-        alike = None if reference is None else self._relative_limits_key(levels, reference)
-        relative = None if alike is None else self._relatives[alike]
+        relative = None if reference is None else self._relative_limits(levels, reference)
         grown: Sequence[Growth | None] = [None] * len(self._channels)
         if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
             grown = growth(levels.bands, relative.bands)
@@ -125,7 +125,7 @@ class LevelJudge:
         values[:, [*missing]] = np.nan
         shown = all_rounded(values.T)
         return tuple(
-            self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, alike, grown[column])
+            self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, relative, grown[column])
             for column, own in enumerate(values.T.tolist())
         )
 
@@ -144,16 +144,8 @@ class LevelJudge:
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
         has grown, or a random part whose kurtosis departs from that of the healthy machine.
 
-        Parameters
-        ----------
-        judged : sequence of ChannelLevels
-            What `judge` returned for the window.
-        latest : LatestContact
-            Of the hops before the latest one, which is added to it.
-        named : bool
-            Whether a parameter has been found to have changed, which a finding would cast doubt on.
-        faulty : sequence of int
-            Columns of sensors at fault, which show neither the machine nor a gain.
+        The latest hop is added to `latest`. If it is `named` which parameter has changed, a finding would cast doubt on
+        that; sensors in `faulty` columns show neither the machine nor a gain.
         """
         if reference is None:
             return Foreign()
@@ -184,11 +176,8 @@ class LevelJudge:
         if grown or kurtosis is None:
             return Foreign(next(iter(grown), ""))
         n_errors = _ERRORS_OF_DOUBT if named else ERRORS
-        departures = [
-            (self._departure(levels, column, state, n_errors), one)
-            for column, one in enumerate(self._channels)
-            if one.name in state.kurtosis
-        ]
+        known = [(column, one) for column, one in enumerate(self._channels) if one.name in state.kurtosis]
+        departures = [(self._departure(levels, column, state, n_errors), one) for column, one in known]
         most, channel = max(departures, key=lambda one: abs(one[0]), default=(0.0, None))
         if channel is None or not most:
             return Foreign()
@@ -270,10 +259,10 @@ class LevelJudge:
         values: list[float],
         record: dict[str, Any],
         levels: WindowLevels,
-        alike: tuple[int, bool, int] | None,
+        relative: RelativeLimits | None,
         grown: Growth | None,
     ) -> ChannelLevels:
-        channel, relative = self._channels[column], None if alike is None else self._relatives[alike]
+        channel = self._channels[column]
         standard = self._standard(channel, levels.speed_rad_s)
         zone = "" if standard is None else zone_of(values[_ROW[standard[1]]], standard[2])
         edge, out, region = None, "", None if relative is None else relative.regions[column]
@@ -281,52 +270,43 @@ class LevelJudge:
             moved = complex(levels.vectors[1, column])
             if abs(moved - region.centre) > region.radius:
                 edge = min(values[_ROW["x1"]], shown_level(channel, "x1", region.alert))  # beyond it in any case
-                was_deg = (
-                    math.degrees(-math.copysign(1.0, levels.speed_rad_s or 0.0) * cmath.phase(region.centre)) % 360
-                )
+                sense = -math.copysign(1.0, levels.speed_rad_s or 0.0)
+                was_deg = math.degrees(sense * cmath.phase(region.centre)) % 360
                 out = (
                     f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: outside its acceptance region around "
                     f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
                 )
-        key, words = (column, alike, standard, zone, edge), MEASURE_WORDS
+        key, words = (column, id(relative), standard, zone, edge), MEASURE_WORDS  # unique while the reference is kept
         limits = self._limits.get(key)
         if limits is None:
             if len(self._limits) >= _MOST_KEPT * len(self._channels):
                 self._limits.clear()
-            limits = self._limits[key] = self._limits_of(column, alike, standard, zone, edge)
+            limits = self._limits[key] = self._limits_of(column, relative, standard, zone, edge)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
             words = {**MEASURE_WORDS, "growth": band_in_words(grown.band_hz)}
         record["zone"] = zone
-        record["limits"] = tuple(
-            [
-                near.normal
-                if near.low <= values[_ROW[name]] < near.high
-                else self._judged_limits(channel, name, values[_ROW[name]], near, words[name], out)
-                for name, near in limits.items()
-            ]
-        )
+        judged = []
+        for name, near in limits.items():
+            value = values[_ROW[name]]
+            within = near.low <= value < near.high
+            judged.append(near.normal if within else self._judged_limits(channel, name, value, near, words[name], out))
+        record["limits"] = tuple(judged)
         return self._blank[column].model_copy(update=record)
 
     def _limits_of(
-        self,
-        column: int,
-        alike: tuple[int, bool, int] | None,
-        standard: _Standard | None,
-        zone: str,
-        edge: float | None,
+        self, column: int, relative: RelativeLimits | None, standard: _Standard | None, zone: str, edge: float | None
     ) -> dict[str, _Nearest]:
         """Limits of a channel except for its bands; `edge` is that for a 1x vector out of its acceptance region."""
         limits = defaultdict[str, list[Limit]](list)
         for own in self._settings.limits:
             if own.channel == self._channels[column].name:
-                limits[own.measure].append(Limit("own limit", True, own.alert, own.danger))
+                limits[own.measure].append(Limit("own limit", True, own.alert or math.inf, own.danger or math.inf))
         if standard is not None:
             name, measure, boundaries = standard
             limits[measure].append(Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries))
-        if alike is not None:
-            for measure, limit in self._relatives[alike].limits[column].items():
-                limits[measure].append(limit)
+        for measure, limit in relative.limits[column].items() if relative is not None else ():
+            limits[measure].append(limit)
         if edge is not None:
             limits["x1"].append(Limit(_X1_VECTOR, False, alert=edge))
         return {name: _nearest_limits(name, found) for name, found in limits.items()}
@@ -344,8 +324,8 @@ class LevelJudge:
         first, second, third = (shown_level(channel, measure, edge) for edge in boundaries)
         return name, measure, (first, second, third)
 
-    def _relative_limits_key(self, levels: WindowLevels, reference: LevelReference) -> tuple[int, bool, int]:
-        """Key of the relative limits of a window, which are computed if no earlier window had the same."""
+    def _relative_limits(self, levels: WindowLevels, reference: LevelReference) -> RelativeLimits:
+        """Relative limits of a window, which are computed if no earlier window had the same."""
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
             self._limits.clear()
@@ -353,22 +333,22 @@ class LevelJudge:
         alike = (id(state), seen, levels.hops)  # unique while the reference is kept
         if alike not in self._relatives:
             self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
-        return alike
+        return self._relatives[alike]
 
     def _judged_limits(
         self, channel: Channel, name: str, value: float, nearest: _Nearest, words: str, out: str
     ) -> LevelLimits:
         """On which side of its limits a level is; `out` is the text for a 1x vector out of its acceptance region."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
-        if danger is not None and value >= (danger.danger or math.inf):
+        if 0 < danger.danger <= value:
             state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
-        elif alert is not None and value >= (alert.alert or math.inf):
+        elif 0 < alert.alert <= value:
             state, decided, what = "alert", alert, f"alert limit {alert.alert:.3g} ({alert.source})"
             if alert.source == _X1_VECTOR:
                 what = out
-        elif fall is not None and value < (fall.fall or 0.0):
+        elif value < fall.fall:
             state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
-        else:  # not a number, or a gap on the other side of zero
+        else:  # not a number
             return nearest.normal
         unit = unit_of(channel.unit, name, channel.quantity in PEAK_TO_PEAK)
         said = f"{channel.name} ({channel.location} {channel.direction}) {words}".rstrip()
@@ -394,28 +374,25 @@ def _blank(plan: LevelPlan, channel: Channel) -> ChannelLevels:
     )
 
 
-def _growth_limit(source: str, alert: float) -> _Nearest:
-    return _nearest_limits("growth", [Limit(source, False, alert)])
-
-
 def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
-    danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
-    alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)
-    fall = max((one for one in limits if one.fall is not None), key=lambda one: one.fall or 0.0, default=None)
-    decided = alert or danger or fall
+    """The nearest of one limit or more, each with an alert or danger limit."""
+    danger, alert = min(limits, key=attrgetter("danger")), min(limits, key=attrgetter("alert"))
+    fall = max(limits, key=attrgetter("fall"))
+    decided = danger if alert.alert == math.inf else alert
     several = len(limits) > 1 or any(one.zones for one in limits)
     normal = LevelLimits(
         measure=name,
-        absolute=decided is not None and decided.absolute,
-        alert=None if alert is None else rounded(alert.alert or 0.0),
-        danger=None if danger is None else rounded(danger.danger or 0.0),
-        fall=None if fall is None else rounded(fall.fall or 0.0),
-        source="" if decided is None else decided.source,
+        absolute=decided.absolute,
+        alert=finite(alert.alert),
+        danger=finite(danger.danger),
+        fall=finite(fall.fall),
+        source=decided.source,
         state="normal",
         bounds=tuple(one.bound() for one in limits if one.source != _X1_VECTOR) if several else (),  # no level's limit
     )
-    high = min((alert and alert.alert) or math.inf, (danger and danger.danger) or math.inf)
-    return _Nearest(alert, danger, fall, normal, (fall and fall.fall) or 0.0, high)
+    # A limit of nothing, as of a dead channel, is shown and not judged by.
+    high = min((edge for edge in (alert.alert, danger.danger) if edge > 0), default=math.inf)
+    return _Nearest(alert, danger, fall, normal, fall.fall, high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,11 +409,13 @@ class ChannelState:
 def channel_state(levels: ChannelLevels) -> ChannelState:
     """Sum up the limits of a channel."""
     limits = levels.limits
-    small = all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits)
     texts = sorted((one.state != "danger", not one.absolute, one.text) for one in limits if one.text)
-    absolute = any(one.state != "normal" and one.absolute for one in limits)
     return ChannelState(
-        levels.beyond != "", levels.beyond == "danger", absolute, small, "; ".join(text for *_, text in texts)
+        beyond=levels.beyond != "",
+        danger=levels.beyond == "danger",
+        absolute=any(one.state != "normal" and one.absolute for one in limits),
+        small=all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits),
+        text="; ".join(text for *_, text in texts),
     )
 
 
@@ -460,16 +439,13 @@ _NO_GROWTH = {"mean", "crest", "kurtosis"}
 
 def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
     """Least growth with which every channel of a window would raise an alert; the one that needs most decides."""
-    nearest = [(one, _nearest(one)) for one in levels]
-    unlimited = [one.channel for one, found in nearest if found is None]
-    if unlimited:
+    nearest = [(_nearest(one), one) for one in levels]
+    if unlimited := [one.channel for found, one in nearest if found is None]:
         *most, last = unlimited
         names, they_have = f"{', '.join(most)} or {last}" if most else last, "they have" if most else "it has"
         text = f"no growth of {names} would have raised an alert: {they_have} no limit yet"
         return LevelGrowth(growth=None, channel=unlimited[0], measure="", text=text)
-    one, (growth, measure, value, limit) = max(
-        ((one, found) for one, found in nearest if found), key=lambda each: each[1]
-    )
+    (growth, measure, value, limit), one = max(((found, one) for found, one in nearest if found), key=itemgetter(0))
     word, unit = MEASURE_WORDS[measure], unit_of(one.unit, measure, one.detection == "peak to peak")
     if measure == "growth":
         word = "strongest band"

@@ -25,13 +25,8 @@ def swell(rest: FloatArray) -> FloatArray:
 
     It is three times the variance of the level (a mean square), estimated by the covariance of pieces two apart. Unlike
     the variance over the pieces, this is next to zero on average if levels differ by chance or by single impacts. It
-    may be negative.
-
-    Parameters
-    ----------
-    rest : ndarray, shape (n, n_samples)
-        Deviations from the mean, without the orders of running speed: an order that beats with a line beside it does
-        not count as a varying level.
+    may be negative. `rest`, shape (n, n_samples), are deviations from the mean without the orders of running speed: an
+    order that beats with a line beside it does not count as a varying level.
     """
     n, size = rest.shape[0], rest.shape[1] // _PIECES
     if not size:
@@ -45,12 +40,8 @@ def swell(rest: FloatArray) -> FloatArray:
 def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[np.complex128]) -> FloatArray:
     """Kurtosis of each hop, corrected for lines, shape (n_hops, n); NaN where their amplitudes are not known.
 
-    Parameters
-    ----------
-    square, fourth : ndarray, shape (n_hops, n)
-        Second and fourth moment about the mean, the latter less `swell`.
-    lines : ndarray of complex, shape (n_hops, n_lines, n)
-        Amplitudes of the lines.
+    Second and fourth moments about the mean, shape (n_hops, n), the latter less `swell`; amplitudes of the lines, shape
+    (n_hops, n_lines, n).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = (fourth + 0.375 * (np.abs(lines) ** 4).sum(axis=1)) / square**2
@@ -71,14 +62,9 @@ def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
-    means = [window.mean() for window in windows]
-    mean = float(values.mean())
-    return HopReference(
-        mean=mean,
-        scatter=float(values.std(ddof=1)),
-        hops=values.size,
-        range=float(np.max(np.abs(np.array(means) - mean))),
-    )
+    mean, scatter = float(values.mean()), float(values.std(ddof=1))
+    farthest = max(abs(float(window.mean()) - mean) for window in windows)
+    return HopReference(mean=mean, scatter=scatter, hops=values.size, range=farthest)
 
 
 GAUSSIAN = 3.0

@@ -13,10 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import BaseModel, Field
 
-from models.levels.bands import BEYOND_RANGE, ERRORS, BandLimits, band_limits
-from models.levels.measures import WindowLevels
+from models.levels.bands import BEYOND_RANGE, ERRORS, NYQUIST_PART, BandLimits, band_limits
+from models.levels.measures import LevelPlan, WindowLevels, level_plan
+from models.levels.orders import ORDERS
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
 from models.levels.settings import LevelSettings
+from models.mistakes import did_you_mean
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from rotorwatch.records.levels import LevelBound
@@ -32,14 +34,15 @@ class Limit:
 
     source: str
     absolute: bool
-    alert: float | None = None
-    danger: float | None = None
-    fall: float | None = None
+    # Infinite where there is none.
+    alert: float = math.inf
+    danger: float = math.inf
+    fall: float = -math.inf
     zones: tuple[float, float, float] | None = field(default=None, kw_only=True)
 
     def bound(self) -> LevelBound:
         """The limit as a record, rounded."""
-        alert, danger, fall = (None if edge is None else rounded(edge) for edge in (self.alert, self.danger, self.fall))
+        alert, danger, fall = map(finite, (self.alert, self.danger, self.fall))
         if self.zones is None:
             return LevelBound(source=self.source, alert=alert, danger=danger, fall=fall)
         first, second, third = map(rounded, self.zones)
@@ -82,17 +85,17 @@ def relative_limits(
         for name, one in state.levels.get(channel.name, {}).items():
             spread = ERRORS * one.error * shorter
             alert = _alert_from(one, given, shorter)
-            danger = None  # levels at another speed say too little
+            danger = math.inf  # levels at another speed say too little
             if seen:
                 danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
                 overall = state.levels[channel.name].get("overall")
                 if name in {"x1", "x2"} and one.mean < ERRORS * one.error and overall is not None:
                     danger = max(danger, _LEAST_DANGER * overall.mean)
-            fall = None  # at another speed a quieter machine is not at fault, as while it runs down
+            fall = -math.inf  # at another speed a quieter machine is not at fault, as while it runs down
             if seen and name in {"overall", "velocity"} and given.fall_ratio:
                 quietest = one.low * min(1 / BEYOND_RANGE, 1 - _filling_margin(one, shorter))
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
-            shown = [None if edge is None else shown_level(channel, name, edge) for edge in (alert, danger, fall)]
+            shown = [shown_level(channel, name, edge) for edge in (alert, danger, fall)]
             of_channel[name] = Limit(source, False, *shown)
             if seen and name == "x1" and one.vector is not None:
                 region = _region(channel, one, complex(*one.vector), alert, shorter)
@@ -200,6 +203,11 @@ def rounded(value: float) -> float:
     return float(f"{value:.5g}")
 
 
+def finite(value: float) -> float | None:
+    """A value `rounded`; None if it is infinite."""
+    return rounded(value) if math.isfinite(value) else None
+
+
 _POWERS_OF_TEN = np.array([float(f"1e{exponent}") for exponent in range(309)])
 
 
@@ -213,3 +221,41 @@ def all_rounded(values: FloatArray) -> list[list[float | None]]:
     shown[~np.isfinite(values)] = None
     rows: list[list[float | None]] = shown.tolist()
     return rows
+
+
+_QUANTITIES: dict[str, tuple[Quantity, ...]] = {"mean": (Quantity.DISPLACEMENT, Quantity.TILT)}
+_QUANTITIES |= dict.fromkeys(("velocity", "high", "envelope"), (Quantity.ACCELERATION,))
+
+
+def unmeasured(
+    settings: LevelSettings, sensors: Sequence[Channel], rate_hz: float, speed_rpm: float | None
+) -> str | None:
+    """Describe the first band or limit without a level, if there is one; orders need an angle or a nominal speed."""
+    band_hz, end_hz = settings.band(speed_rpm), NYQUIST_PART * rate_hz / 2
+    if settings.band_hz is not None and band_hz[0] >= end_hz:
+        return f"levels.band_hz begins at {band_hz[0]:g} Hz, expected below 0.4 of rate_hz, {end_hz:g} Hz"
+    channels = [one for one in sensors if one.quantity is not Quantity.SHAFT_ANGLE]
+    plan = level_plan(channels, rate_hz, band_hz)
+    turning = speed_rpm is not None or len(channels) < len(sensors)
+    names = [one.name for one in channels]
+    for limit in settings.limits:
+        if limit.channel not in names:
+            hint = did_you_mean(limit.channel, names)
+            return f"levels.limits: no channel {limit.channel!r}; there are {', '.join(names)}{hint}"
+        if why := _missing(plan, names.index(limit.channel), limit.measure, turning=turning):
+            return f"levels.limits: {limit.channel} has no {limit.measure}{why}"
+    return None
+
+
+def _missing(plan: LevelPlan, column: int, measure: str, *, turning: bool) -> str | None:
+    """Why a channel has no such level; None if it has."""
+    wanted = _QUANTITIES.get(measure, ())
+    if wanted and plan.quantities[column] not in wanted:
+        return f": it is a {plan.quantities[column].value}, expected {' or '.join(one.value for one in wanted)}"
+    if measure in {"high", "envelope"} and plan.high_hz is None:
+        return f" at {plan.rate_hz:g} samples per second, expected 5000 or more"
+    if measure == "s_max" and column not in [first for first, _ in plan.pairs]:
+        return ": expected the first of two displacements of one place in two directions"
+    if measure in ORDERS and not turning:
+        return ": the running speed is not known, expected a shaft angle or [operation] speed_rpm"
+    return None

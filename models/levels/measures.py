@@ -40,7 +40,7 @@ import scipy  # its sub-packages are loaded when they are first used
 from models.checkpoint import checked
 from models.levels.bands import ERRORS, NYQUIST_PART, BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
-from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
+from models.levels.orders import ORDERS, ComplexArray, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 from models.signals.waveform import Waveform
@@ -62,7 +62,6 @@ STANDS_RAD_S = 2 * np.pi * 0.5
 """Speed, rad/s, up to which a shaft counts as standing still."""
 _LEAST_HOPS = 4  # fewest from which the scatter of a line is estimated
 
-_ComplexArray = npt.NDArray[np.complex128]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
 
@@ -74,11 +73,11 @@ class LevelPlan:
     quantities: tuple[Quantity, ...]  # of the columns that levels are taken of
     band_hz: tuple[float, float]  # of velocities, from and to
     pairs: tuple[tuple[int, int], ...]  # columns of two displacements of one place
-    skew: tuple[float, ...]  # cosine of the angle between their axes: 0 at right angles, as nearly all are
     # (n,), run-out, which is subtracted from 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
-    runout: _ComplexArray | None = None
+    runout: ComplexArray | None = None
     lines: bool = False  # whether the strongest bin of every narrow band is wanted
-    # Columns examined for a contact and their skew: `pairs`, and velocities of the rotor at a place without one.
+    # Columns examined for a contact: `pairs`, and velocities of the rotor at a place without one. Each with the cosine
+    # of the angle between the axes: 0 at right angles, as nearly all are.
     contacts: tuple[tuple[int, int, float], ...] = ()
 
     @property
@@ -112,32 +111,21 @@ def level_plan(
     channels: Sequence[Channel],
     rate_hz: float,
     band_hz: tuple[float, float],
-    runout: _ComplexArray | None = None,
+    runout: ComplexArray | None = None,
     *,
     lines: bool = False,
 ) -> LevelPlan:
-    """Plan the levels of a machine.
+    """Plan the levels of a machine's channels, none of them a shaft angle, in the order of the columns.
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-        In the order of the columns; none of them a shaft angle.
-    band_hz : tuple of float
-        Of velocities; its upper end is limited by the sampling rate.
+    The upper end of the band of velocities is limited by the sampling rate.
     """
     pairs = _pairs(channels, Quantity.DISPLACEMENT)
     unseen = {"bearing", "disc"} - {channels[first].location for first, _ in pairs}
     moving = [one for one in _pairs(channels, Quantity.VELOCITY) if channels[one[0]].location in unseen]
-    return LevelPlan(
-        rate_hz,
-        tuple(one.quantity for one in channels),
-        (band_hz[0], min(band_hz[1], NYQUIST_PART * rate_hz / 2)),
-        tuple(pairs),
-        tuple(_skew(channels[first], channels[second]) for first, second in pairs),
-        runout if runout is not None and np.any(runout) else None,
-        lines,
-        tuple((first, second, _skew(channels[first], channels[second])) for first, second in pairs + moving),
-    )
+    contacts = tuple((first, second, _skew(channels[first], channels[second])) for first, second in pairs + moving)
+    quantities, end_hz = tuple(one.quantity for one in channels), min(band_hz[1], NYQUIST_PART * rate_hz / 2)
+    runout = runout if runout is not None and np.any(runout) else None
+    return LevelPlan(rate_hz, quantities, (band_hz[0], end_hz), tuple(pairs), runout, lines, contacts)
 
 
 def _pairs(channels: Sequence[Channel], quantity: Quantity) -> list[tuple[int, int]]:
@@ -169,7 +157,7 @@ class HopLevels:
     sums: FloatArray
     # (4, n), q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; NaN without a rotation. At half running speed its
     # phase means nothing, because the shaft angle is known only modulo a turn.
-    orders: _ComplexArray
+    orders: ComplexArray
     bands: FloatArray  # (n_bands, n), mean squares in the bands of `models.levels.bands`
     lines: FloatArray  # (n_bands, n), mean square of each band's strongest bin; no rows if lines are not wanted
 
@@ -181,14 +169,11 @@ class HopLevels:
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopLevels":
         """Levels from what `checkpoint` gave, see `models.checkpoint`."""
+        n_samples = int(checked(arrays, "n_samples", np.int64, ()))
         sums = checked(arrays, "sums", np.float64, (len(_SUMS), None))
-        return cls(
-            int(checked(arrays, "n_samples", np.int64, ())),
-            sums,
-            checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1])),
-            checked(arrays, "bands", np.float64, (None, sums.shape[1])),
-            checked(arrays, "lines", np.float64, (None, sums.shape[1])),
-        )
+        orders = checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1]))
+        bands, lines = (checked(arrays, name, np.float64, (None, sums.shape[1])) for name in ("bands", "lines"))
+        return cls(n_samples, sums, orders, bands, lines)
 
 
 def hop_levels(
@@ -240,7 +225,7 @@ def hop_levels(
         sums[8:, accelerations] = power[accelerations, 0] * _acceleration_squares(
             plan, spectrum[accelerations], parts[accelerations], slice(cuts[first], cuts[last]), n_samples
         )
-    for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
+    for y, z, skew in plan.contacts[: len(plan.pairs)]:
         distance = square[y] + square[z]
         if skew:
             distance -= 2 * skew * x[y] * x[z]
@@ -298,14 +283,14 @@ class WindowLevels:
     values: Mapping[str, FloatArray]  # (n,) by measure; NaN where a quantity has none, or the rotation is not known
     # (n,), standard errors, from the scatter of the hops, of the measures in `COMPARED`; empty if not asked for.
     errors: Mapping[str, FloatArray]
-    vectors: _ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
+    vectors: ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
     speed_rad_s: float | None = None  # mean; None where it is not known
     hops: int = 1
     bands: BandLevels | None = None
     lines: FloatArray | None = None  # (n_hops, n_bands, n), mean squares of each band's strongest bin, if looked for
     speeds_rad_s: FloatArray | None = None  # (n_hops,), NaN where it is not known
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
-    moments: tuple[FloatArray, FloatArray, _ComplexArray, FloatArray] | None = None
+    moments: tuple[FloatArray, FloatArray, ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
 
     def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
@@ -321,11 +306,11 @@ class WindowLevels:
             lone[[*pair]] |= gone[[*pair]].any()
         bands = replace(self.bands, rms=np.where(gone, np.nan, self.bands.rms))
         values = {name: np.where(lone if name == "s_max" else gone, np.nan, one) for name, one in self.values.items()}
-        moments, contact = self.moments, self.contact
+        moments = self.moments
         if moments is not None:
             square, fourth, orders, in_bands = moments
             moments = square, np.where(gone, np.nan, fourth), orders, np.where(gone, np.nan, in_bands)
-        contact = None if contact is None else np.where(lone, np.nan, contact)
+        contact = None if self.contact is None else np.where(lone, np.nan, self.contact)
         return replace(self, values=values, bands=bands, moments=moments, contact=contact)
 
     @property
@@ -423,12 +408,8 @@ def window_levels(
             "kurtosis": average[3] / average[7] ** 2,
         }
     edges_hz, freedom = _band_grid(plan.rate_hz, hops[0].n_samples, count)
-    bands = BandLevels(
-        edges_hz,
-        np.sqrt(_mean(in_bands)),
-        np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None,
-        freedom,
-    )
+    error = np.sqrt(in_bands).std(axis=0) / np.sqrt(max(1, count - 1)) if errors else None
+    bands = BandLevels(edges_hz, np.sqrt(_mean(in_bands)), error, freedom)
     lines = np.stack([hop.lines for hop in hops]) if plan.lines else None
     moments = sums[:, 7], sums[:, 3] - sums[:, 6], every_order[:, 1:], in_bands
     contact = sums[:, CONTACT]
@@ -453,7 +434,7 @@ def _compared(plan: LevelPlan, sums: FloatArray) -> dict[str, FloatArray]:
     }
 
 
-def _order_errors(orders: _ComplexArray, vectors: _ComplexArray | None) -> FloatArray:
+def _order_errors(orders: ComplexArray, vectors: ComplexArray | None) -> FloatArray:
     """Standard errors of the amplitudes at the orders, shape (4, n)."""
     count, *shape = orders.shape
     if not count:

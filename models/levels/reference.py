@@ -130,19 +130,13 @@ def expected_levels(
     bands, parts, nothing = {}, {}, HopReference(mean=0.0, scatter=1.0, hops=_BY_THEORY, range=_OF_MEANS)
     if levels.bands is not None and levels.lines is not None:
         edges_hz, none = tuple(levels.bands.edges_hz.tolist()), (0.0,) * len(levels.bands.freedom)
-        silent = BandReference(
-            edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=tuple(levels.bands.freedom.tolist())
-        )
+        freedom = tuple(levels.bands.freedom.tolist())
+        silent = BandReference(edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=freedom)
         found = tuple(expected_lines(levels.bands, levels.hops, modes).round(3).tolist())
         bands, parts = dict.fromkeys(channels, silent), dict.fromkeys(channels, found)
+    contact = {} if levels.contact is None else dict.fromkeys(channels, nothing)
     state = OperatingState(
-        windows=1,
-        speed_rad_s=speeds_rad_s,
-        levels={},
-        hops=levels.hops,
-        bands=bands,
-        lines=parts,
-        contact={} if levels.contact is None else dict.fromkeys(channels, nothing),
+        windows=1, speed_rad_s=speeds_rad_s, levels={}, hops=levels.hops, bands=bands, lines=parts, contact=contact
     )
     return LevelReference(source="the machine file", states=(state,))
 
@@ -203,16 +197,11 @@ def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> Refere
     vector, turned = None, 0.0
     if name == "x1" and all(one.vectors is not None for one in levels):
         of_windows = np.array([one.vectors[1, column] for one in levels if one.vectors is not None])
-        mean = complex(of_windows.mean())
-        vector, turned = (mean.real, mean.imag), float(np.abs(of_windows - mean).max())
-    return ReferenceLevel(
-        mean=float(values.mean()),
-        low=float(values.min()),
-        high=float(values.max()),
-        error=float(np.nanmean(errors)) if np.any(np.isfinite(errors)) else 0.0,
-        vector=vector,
-        turned=turned,
-    )
+        centre = complex(of_windows.mean())
+        vector, turned = (centre.real, centre.imag), float(np.abs(of_windows - centre).max())
+    mean, low, high = float(values.mean()), float(values.min()), float(values.max())
+    error = float(np.nanmean(errors)) if np.any(np.isfinite(errors)) else 0.0
+    return ReferenceLevel(mean=mean, low=low, high=high, error=error, vector=vector, turned=turned)
 
 
 class FirstWindows:
@@ -221,18 +210,11 @@ class FirstWindows:
     A channel whose values are NaN in some of them is learned from the others.
 
     If the machine was not seen to turn in them, and every channel vibrates four times as much once it is, it stood
-    still: the first windows in which it turns become a second reference.
+    still: the first windows in which it turns become a second reference. It `turns` if rotation can be detected, by a
+    shaft angle or near a nominal speed.
 
-    Parameters
-    ----------
-    count : int
-        Number of windows, which do not overlap.
-    turns : bool
-        Whether rotation can be detected: by a shaft angle, or near a nominal speed.
-    since : str
-        Since when they count, as operators will read it; empty if from the beginning.
-    of : str
-        Identifies what the levels depend on: a reference of another machine, or other settings, is not restored.
+    Windows do not overlap. Operators read `since` when they count, empty if from the beginning. `of` identifies what
+    the levels depend on: a reference of another machine, or other settings, is not restored.
     """
 
     def __init__(
@@ -250,9 +232,8 @@ class FirstWindows:
     @property
     def learning(self) -> bool:
         """Whether windows are still taken."""
-        return self.reference is None or (
-            self._turns and all(state.speed_rad_s is None for state in self.reference.states)
-        )
+        states = () if self.reference is None else self.reference.states
+        return not states or (self._turns and all(state.speed_rad_s is None for state in states))
 
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
         """Learn from a full window, if it is still needed and does not overlap the last one."""
@@ -281,7 +262,7 @@ class FirstWindows:
         seen = self._seen
         speeds = [math.nan if one.speed_rad_s is None else one.speed_rad_s for one in seen]
         shape = (len(seen), len(COMPARED), len(self._channels))
-        vectors = [np.zeros((0, 0)) if one.vectors is None else one.vectors for one in seen]
+        none = np.zeros((0, 0), dtype=np.complex128)
         return {
             "of": np.array([self._of]),
             "reference": np.array(["" if self.reference is None else self.reference.model_dump_json()]),
@@ -296,7 +277,7 @@ class FirstWindows:
                 if one.bands is not None
                 for name in ("edges_hz", "rms", "errors", "freedom")
             },
-            **{f"vectors_{number}": np.asarray(each, np.complex128) for number, each in enumerate(vectors)},
+            **{f"vectors_{number}": none if one.vectors is None else one.vectors for number, one in enumerate(seen)},
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -318,24 +299,22 @@ class FirstWindows:
         hops = checked(arrays, "hops", np.int64, (speeds.size,)).tolist()
         shape = (speeds.size, len(COMPARED), len(self._channels))
         values, errors = (checked(arrays, name, np.float64, shape) for name in ("values", "errors"))
-        vectors = [checked(arrays, f"vectors_{number}", np.complex128, (None, None)) for number in range(speeds.size)]
         flat, wide = (None,), (None, shape[2])
         forms = {"edges_hz": flat, "rms": wide, "errors": wide, "freedom": flat}
-        bands = [
-            BandLevels(**{name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in forms.items()})
-            if f"rms_{n}" in arrays
-            else None
-            for n in range(speeds.size)
-        ]
-        self._seen = [
-            WindowLevels(
-                dict(zip(COMPARED, values[number], strict=True)),
-                dict(zip(COMPARED, errors[number], strict=True)),
-                vectors[number] if vectors[number].size else None,
-                speed if math.isfinite(speed) else None,
-                hops[number],
-                bands[number],
+        seen = []
+        for n, speed in enumerate(speeds.tolist()):
+            vectors = checked(arrays, f"vectors_{n}", np.complex128, (None, None))
+            given = forms if f"rms_{n}" in arrays else {}
+            bands = {name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in given.items()}
+            seen.append(
+                WindowLevels(
+                    dict(zip(COMPARED, values[n], strict=True)),
+                    dict(zip(COMPARED, errors[n], strict=True)),
+                    vectors if vectors.size else None,
+                    speed if math.isfinite(speed) else None,
+                    hops[n],
+                    BandLevels(**bands) if bands else None,
+                )
             )
-            for number, speed in enumerate(speeds.tolist())
-        ]
-        self.reference, self._end_ns = reference, int(checked(arrays, "end_ns", np.int64, ()))
+        end_ns = int(checked(arrays, "end_ns", np.int64, ()))
+        self._seen, self.reference, self._end_ns = seen, reference, end_ns

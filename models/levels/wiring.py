@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.levels.gains import place_of
+from models.levels.orders import ComplexArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
@@ -22,18 +23,11 @@ _LEAST_DISTANCE = 2.0  # least distance from the healthy vector, in tolerances, 
 _MOST_ERROR = 0.12  # largest standard error, as a part of the healthy vector
 _MEDIAN_STEP = 1.1774  # median length of a hop-to-hop step over the standard deviation of a hop's vector
 
-_ComplexArray = npt.NDArray[np.complex128]
 
-
-def rewired(vectors: _ComplexArray, healthy: _ComplexArray, channels: Sequence[Channel]) -> SensorFault | None:
+def rewired(vectors: ComplexArray, healthy: ComplexArray, channels: Sequence[Channel]) -> SensorFault | None:
     """Find places that show each other's healthy 1x vectors, or reversed ones, while all others show their own.
 
-    Parameters
-    ----------
-    vectors : ndarray, shape (n_hops, n)
-        1x vectors of the channels in the hops of a window.
-    healthy : ndarray, shape (n,)
-        1x vectors of the healthy machine at the same speed.
+    `vectors`, shape (n_hops, n), are those in the hops of a window; `healthy`, shape (n,), those at the same speed.
     """
     places: dict[str, list[int]] = {}
     for column, channel in enumerate(channels):

@@ -60,7 +60,7 @@ def colouring_filter(source: Source) -> ColouringFilter:
     R[n:, n:] = w * np.array([[0.0, 1.0], [-1.0, -2 * source.hump_damping]])
     S = np.zeros((n + 2, 2))
     S[:n, :1] = floor.S
-    S[n + 1, 1] = 2 * math.sqrt(source.hump_damping * w)  # makes both states of unit variance, like filter_gain
+    S[n + 1, 1] = 2 * math.sqrt(source.hump_damping * w)  # makes both states of unit variance
     output = np.zeros(n + 2)
     output[0] = math.sqrt(1 - source.hump_share)
     output[n + 1] = math.sqrt(source.hump_share)
@@ -71,10 +71,11 @@ def _butterworth(cutoff_hz: float, order: int) -> ColouringFilter:
     output = np.zeros(order)
     output[0] = 1.0
     S = np.zeros((order, 1))
-    if order == 2:
-        S[1, 0] = filter_gain(cutoff_hz)
-        return ColouringFilter(filter_R(cutoff_hz), S, output)
     w = 2 * math.pi * cutoff_hz
+    if order == 2:
+        # The stationary variance of u for ü + 2ζω u̇ + ω² u = g ω w is g²/(4ζω); with states scaled by ω, g is 2√(ζω).
+        S[1, 0] = 2 * math.sqrt(FILTER_DAMPING * 2 * math.pi * cutoff_hz)
+        return ColouringFilter(w * np.array([[0.0, 1.0], [-1.0, -2 * FILTER_DAMPING]]), S, output)
     angles = math.pi * (2 * np.arange(order) + 1 + order) / (2 * order)
     polynomial = np.poly(np.exp(1j * angles)).real  # highest power first, 1 at both ends
     R = np.diag(np.ones(order - 1), 1)
@@ -93,27 +94,12 @@ def _floor_density(cutoff_hz: float, order: int) -> float:
 
 def source_spectrum(frequency_hz: FloatArray, source: Source) -> FloatArray:
     """Two-sided power spectral density of a source's force, N²/Hz; same shape as `frequency_hz`."""
-    floor = _floor_density(source.cutoff_hz, source.order) / (
-        1 + (frequency_hz / source.cutoff_hz) ** (2 * source.order)
-    )
+    fallen = 1 + (frequency_hz / source.cutoff_hz) ** (2 * source.order)
+    floor = _floor_density(source.cutoff_hz, source.order) / fallen
     r2 = (frequency_hz / source.hump_hz) ** 2
     hump = 2 * source.hump_damping / (math.pi * source.hump_hz) * r2 / ((1 - r2) ** 2 + 4 * source.hump_damping**2 * r2)
     density = (1 - source.hump_share) * floor + source.hump_share * hump
     return np.asarray(source.force_rms_N**2 * density, dtype=np.float64)
-
-
-def filter_R(cutoff_hz: float) -> FloatArray:
-    """System matrix R of the colouring filter (Eq. 7), shape (2, 2), states (u, u̇/ω_c), so that both have one unit."""
-    w = 2 * math.pi * cutoff_hz
-    return w * np.array([[0.0, 1.0], [-1.0, -2 * FILTER_DAMPING]])
-
-
-def filter_gain(cutoff_hz: float) -> float:
-    """S* of Eq. (7): gain for white noise of unit intensity with which u(t) has unit variance.
-
-    The stationary variance of u for ü + 2ζω u̇ + ω² u = g ω w is g²/(4ζω); with states scaled by ω the gain is 2√(ζω).
-    """
-    return 2 * math.sqrt(FILTER_DAMPING * 2 * math.pi * cutoff_hz)
 
 
 def low_pass(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> FloatArray:

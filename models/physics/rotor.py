@@ -203,9 +203,6 @@ def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     return A
 
 
-_LEAST_CHANGE = -1.0  # a quantity that is positive by nature cannot lose all of its value
-
-
 def impossible(change: float, quantity: str) -> str:
     """Why a relative change of a positive quantity (a mass, a gain, a length) is impossible; empty if it is possible.
 
@@ -216,7 +213,6 @@ def impossible(change: float, quantity: str) -> str:
     >>> impossible(-4.7, "mass")
     'reads as −470 %, which is impossible: a mass cannot fall by 100 % or more'
     """
-    if change > _LEAST_CHANGE:
+    if change > -1:
         return ""
-    size = f"{-100 * change:.0f}"
-    return f"reads as −{size} %, which is impossible: a {quantity} cannot fall by 100 % or more"
+    return f"reads as −{-100 * change:.0f} %, which is impossible: a {quantity} cannot fall by 100 % or more"

@@ -61,13 +61,11 @@ class NewestBlocks:
 
 
 _ORDER = 4
-_SETTLING = 5.0
-_VALID = 2.0
 
 
 def lowest_valid_hz(high_pass_hz: float) -> float:
     """Frequency above which amplitudes are right within 0.4 %: twice the corner of the high-pass."""
-    return _VALID * high_pass_hz
+    return 2.0 * high_pass_hz
 
 
 def settling_s(high_pass_hz: float) -> float:
@@ -75,7 +73,7 @@ def settling_s(high_pass_hz: float) -> float:
 
     The slowest pole of the filter decays with sin(π/8) of its corner frequency, to 6e-6 within this time.
     """
-    return _SETTLING / high_pass_hz
+    return 5.0 / high_pass_hz
 
 
 def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_hz: float) -> FloatArray:

@@ -85,9 +85,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     location: str = Field(min_length=1, max_length=32, pattern=_PLACE)
     direction: str = Field(min_length=1, max_length=32, pattern=_PLACE)
     # One of `UNIT_TO_SI` for the quantity.
-    unit: str = Field(
-        description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
-    )
+    unit: str = Field(description="; ".join(f"{', '.join(units)} for {of}" for of, units in UNIT_TO_SI.items()))
     # Left out if not given: descriptors without it, and their hashes, stay as they were before it existed.
     angle_deg: float | None = Field(
         default=None, ge=-360, le=360, exclude_if=not_given, description="angle of the sensor's axis from +y towards +z"
@@ -103,10 +101,8 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     def _known_unit_and_place(self) -> Self:
         units = UNIT_TO_SI[self.quantity]
         if self.unit not in units:
-            raise ValueError(
-                f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
-                f"{did_you_mean(self.unit, units)}"
-            )
+            known_units = f"{', '.join(units)} for {self.quantity}{did_you_mean(self.unit, units)}"
+            raise ValueError(f"channel {self.name}: unit {self.unit!r} is not one of {known_units}")
         if self.angle_deg is not None:
             self._check_angle(self.angle_deg)
         elif (self.quantity, self.location, self.direction) in _STATE_NAMES:
@@ -132,10 +128,9 @@ class Channel(BaseModel, extra="forbid", frozen=True):
                 f"expected it with {', '.join(_RATES)} only"
             )
         if _cardinal(angle_deg) != {"y": 0, "z": 1}.get(self.direction, _cardinal(angle_deg)):
-            raise ValueError(
-                f"channel {self.name}: direction {self.direction!r} and angle_deg {angle_deg:g} contradict each other; "
-                "give the direction the name it has on the machine, such as X or Y"
-            )
+            both = f"direction {self.direction!r} and angle_deg {angle_deg:g}"
+            advice = "give the direction the name it has on the machine, such as X or Y"
+            raise ValueError(f"channel {self.name}: {both} contradict each other; {advice}")
 
     @property
     def axis(self) -> tuple[float, float]:
@@ -240,16 +235,12 @@ def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
                 "more are watched at a place with another name"
             )
         if others:
-            raise ValueError(
-                f"channel {' and '.join(others)}: measures y or z of {location} beside {said}, which are "
-                "resolved into them; expected two sensors of a quantity at a place"
-            )
+            beside = f"measures y or z of {location} beside {said}, which are resolved into them"
+            raise ValueError(f"channel {' and '.join(others)}: {beside}; expected two sensors of a quantity at a place")
         apart = apart_deg(channels[angled[0]], channels[angled[1]])
         if apart < LEAST_APART_DEG - 1e-9:
-            raise ValueError(
-                f"channels {said}: their axes are {round(apart, 1):g}° apart, expected at least {LEAST_APART_DEG:g}°: "
-                "two sensors that point the same way cannot tell y from z"
-            )
+            least = f"at least {LEAST_APART_DEG:g}°: two sensors that point the same way cannot tell y from z"
+            raise ValueError(f"channels {said}: their axes are {round(apart, 1):g}° apart, expected {least}")
         first, second = angled
         nearer = abs(channels[second].axis[0]) > abs(channels[first].axis[0]) + 1e-9
         found.append((second, first) if nearer else (first, second))
@@ -383,10 +374,8 @@ def unit_factor(quantity: str, unit: str) -> float:
     accepted = f"expected one of {', '.join(known)}"
     detected = _DETECTED.search(spelled)
     if detected and _spelled(spelled[: detected.start()]) in {name for units in _UNITS.values() for name in units}:
-        raise ValueError(
-            f"unit {unit!r} is that of an overall value ({detected.group(1)}), but waveform samples are "
-            f"needed: they have no peak-to-peak or rms unit; {accepted}"
-        )
+        what = f"is that of an overall value ({detected.group(1)}), but waveform samples are needed"
+        raise ValueError(f"unit {unit!r} {what}: they have no peak-to-peak or rms unit; {accepted}")
     others = [name for name, units in _UNITS.items() if spelled in units]
     if others:
         raise ValueError(f"unit {unit!r} is a unit of {' or '.join(others)}, not of {quantity}; {accepted}")

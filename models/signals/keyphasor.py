@@ -77,9 +77,8 @@ class EdgeDetector:
         self._armed = bool(low[since:].any()) or (not crossings.size and self._armed)
         self._last = (float(time[-1]), float(value[-1]))
         step = value[counted + 1] - value[counted]
-        return np.asarray(
-            time[counted] + (self._threshold - value[counted]) / step * (time[counted + 1] - time[counted])
-        )
+        part = (self._threshold - value[counted]) / step
+        return np.asarray(time[counted] + part * (time[counted + 1] - time[counted]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,15 +138,10 @@ def pulses_in_turn(trains: Sequence[PulseTrain]) -> PulseTrain:
     for train in trains:
         counts.append(train.counts + end)
         end = -(-int(counts[-1][-1] + 1) // train.pulses_per_turn) * train.pulses_per_turn
-    apart = np.zeros(1, dtype=np.bool_)
-    return PulseTrain(
-        np.concatenate([one.times for one in trains]),
-        np.concatenate(counts),
-        np.concatenate([part for one in trains for part in (apart, one.known)][1:]),
-        trains[0].pulses_per_turn,
-        sum(one.missing for one in trains),
-        sum(one.extra for one in trains),
-    )
+    times, apart = np.concatenate([one.times for one in trains]), np.zeros(1, dtype=np.bool_)
+    known = np.concatenate([part for one in trains for part in (apart, one.known)][1:])
+    missing, extra = sum(one.missing for one in trains), sum(one.extra for one in trains)
+    return PulseTrain(times, np.concatenate(counts), known, trains[0].pulses_per_turn, missing, extra)
 
 
 def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> FloatArray:

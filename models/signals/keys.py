@@ -24,8 +24,6 @@ from models.errors import MachineFileError
 
 PREFIX = "rotorwatch"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-
-
 Topic = Literal["report", "alarm_event", "alarm_state", "health"]
 """What a monitor publishes, by the names of the fields of `MachineKeys`."""
 
@@ -56,9 +54,8 @@ class MachineKeys:
     def __post_init__(self) -> None:
         for field, value in (("site", self.site), ("machine", self.machine)):
             if not _NAME.fullmatch(value):
-                raise MachineFileError(
-                    f"{field} name {value!r} cannot be part of a key: use 1 to 64 letters, digits, '_' or '-'"
-                )
+                why = "use 1 to 64 letters, digits, '_' or '-'"
+                raise MachineFileError(f"{field} name {value!r} cannot be part of a key: {why}")
 
     @property
     def root(self) -> str:
@@ -80,7 +77,7 @@ class MachineKeys:
 
 _Flow = Literal["ingress", "egress"]
 _USER = re.compile(r"[^\s:]+")
-_PLACE = re.compile(r"(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})/(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})")
+_PLACE = re.compile(rf"(\*|{_NAME.pattern})/(\*|{_NAME.pattern})")
 _MODEL = MachineKeys("s", "m")
 
 
@@ -91,11 +88,9 @@ def _topics(*keys: str) -> tuple[str, ...]:
 _DATA = _topics(_MODEL.stream, _MODEL.descriptor, _MODEL.truth)
 _RESULTS = _topics(_MODEL.report, _MODEL.health, _MODEL.alarm_event, _MODEL.alarm_state)
 _HEALTH = _topics(_MODEL.health)
-_PUBLISHER_ALIVE = _topics(_MODEL.publisher_alive)
-_MONITOR_ALIVE = _topics(_MODEL.monitor_alive)
+_PUBLISHER_ALIVE, _MONITOR_ALIVE = _topics(_MODEL.publisher_alive), _topics(_MODEL.monitor_alive)
 _ALIVE = ("/alive/**",)
 _ALL = ("/**", "/**/@adv/**")
-_EVERYWHERE = (f"{PREFIX}/**", f"{PREFIX}/**/@adv/**")
 _LISTENED = ("declare_subscriber", "query")
 _LIVELINESS = ("declare_liveliness_subscriber", "liveliness_query")
 # These tell a partner who listens and who asks. They neither read nor write data, and without them nothing is sent.
@@ -137,13 +132,7 @@ class Grant(BaseModel, extra="forbid", frozen=True):
 
 
 def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert_common_names"]) -> dict[str, object]:
-    """Zenoh's ``access_control`` for these grants: what none of them allows is dropped.
-
-    Parameters
-    ----------
-    known_by : {"usernames", "cert_common_names"}
-        What the names in `Grant.who` are.
-    """
+    """Zenoh's ``access_control`` for these grants, with names of one kind: what none of them allows is dropped."""
     rules: list[dict[str, object]] = []
     allowed: dict[str, list[str]] = {}
     for grant in grants:
@@ -164,7 +153,8 @@ def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert
 
 
 def _rules(grant: Grant) -> list[tuple[_Flow, tuple[str, ...], list[str]]]:
-    publishes, views, monitors = _roots(grant.publishes), _roots(grant.views), _roots(grant.monitors)
+    placed = (grant.publishes, grant.views, grant.monitors)
+    publishes, views, monitors = ([f"{PREFIX}/{place}" for place in places] for places in placed)
     rules: list[tuple[_Flow, tuple[str, ...], list[str]]] = []
     if publishes:
         rules += [
@@ -183,25 +173,16 @@ def _rules(grant: Grant) -> list[tuple[_Flow, tuple[str, ...], list[str]]]:
             ("ingress", ("liveliness_token",), _recovery(views, _RESULTS, "sub")),
         ]
     if monitors:
+        recovery = _recovery(monitors, _RESULTS, "pub") + _recovery(monitors, (*_DATA, *_RESULTS), "sub")
         rules += [
             ("ingress", (*_LISTENED, *_LIVELINESS), _at(monitors, _ALL)),
             ("egress", ("put", "reply", "liveliness_token"), _at(monitors, _ALL)),
             ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(monitors, _RESULTS)),
-            (
-                "ingress",
-                ("liveliness_token",),
-                _at(monitors, _MONITOR_ALIVE)
-                + _recovery(monitors, _RESULTS, "pub")
-                + _recovery(monitors, (*_DATA, *_RESULTS), "sub"),
-            ),
+            ("ingress", ("liveliness_token",), _at(monitors, _MONITOR_ALIVE) + recovery),
         ]
     if publishes or monitors:
-        rules.append(("egress", _INTERESTS, list(_EVERYWHERE)))
+        rules.append(("egress", _INTERESTS, _at([PREFIX], _ALL)))
     return rules
-
-
-def _roots(places: Sequence[str]) -> list[str]:
-    return [f"{PREFIX}/{place}" for place in places]
 
 
 def _at(roots: Sequence[str], topics: Sequence[str]) -> list[str]:

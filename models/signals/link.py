@@ -22,7 +22,6 @@ from models.signals.keys import Grant, access_control
 _HOST_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _LOCAL_PROTOCOLS = ("unixsock-stream", "unixpipe")
 _PORTLESS_PROTOCOLS = (*_LOCAL_PROTOCOLS, "serial", "vsock")
-_LOCAL = "127.0.0.1"
 _HIGHEST_PORT = 65535
 
 
@@ -76,19 +75,10 @@ def endpoint_fault(text: str) -> str | None:
         return f"{text!r}: expected a port, a number, after the host; did you mean {meant}?"
     known = [name for name in _HOST_PROTOCOLS if did_you_mean(protocol.rstrip(":"), [name])] or ["tcp"]
     place = re.fullmatch(rf"(?:[\w-]*:?/+)?(?:{host}:)?(\d+)", text)
-    meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or _LOCAL}:{place[2]}"
+    meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or '127.0.0.1'}:{place[2]}"
     if re.fullmatch(r"[A-Za-z][\w.-]*", text):
         meant = f"tcp/{text}:7447"
     return f"{text!r}: expected PROTOCOL/HOST:PORT; did you mean {meant}?"
-
-
-def _password_in(path: Path) -> str:
-    lines = _secret("password_file", path).splitlines()
-    if len(lines) != 1 or not lines[0].strip():
-        raise MachineFileError(
-            f"link.password_file: {path}: expected one line with the password, found {len(lines)} lines"
-        )
-    return lines[0].strip()
 
 
 def _user_names_in(path: Path) -> frozenset[str]:
@@ -98,9 +88,8 @@ def _user_names_in(path: Path) -> frozenset[str]:
         name, colon, password = line.partition(":")
         if not (name and colon and password) or line != line.strip() or " " in name:
             # Never the line itself: there is a password in it.
-            raise MachineFileError(
-                f"{place}: line {number}: expected name:password, without spaces around them, comments or empty lines"
-            )
+            form = "name:password, without spaces around them, comments or empty lines"
+            raise MachineFileError(f"{place}: line {number}: expected {form}")
         if name in names:
             raise MachineFileError(f"{place}: line {number}: the user {name} already has a line")
         names.append(name)
@@ -118,9 +107,8 @@ def _check_key(certificate: Path, key: Path) -> None:
     """Check that a file holds a private key that others may not read, and that it belongs to the certificate."""
     text = _secret("tls.key", key)
     if "ENCRYPTED" in text:
-        raise MachineFileError(
-            f"link.tls.key: {key}: the private key needs a passphrase, which cannot be entered here; expected none"
-        )
+        why = "the private key needs a passphrase, which cannot be entered here; expected none"
+        raise MachineFileError(f"link.tls.key: {key}: {why}")
     if "PRIVATE KEY-----" not in text:
         raise MachineFileError(f"link.tls.key: {key}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
     try:
@@ -135,10 +123,8 @@ def _secret(field: str, path: Path) -> str:
     except OSError as error:
         raise MachineFileError(f"link.{field}: {path}: cannot be read ({error.strerror})") from error
     if os.name == "posix" and mode & stat.S_IRWXO:
-        raise MachineFileError(
-            f"link.{field}: {path}: every user of this computer may read or change it (mode {mode:04o}); "
-            f"protect it with: chmod 600 {path}"
-        )
+        open_to = f"every user of this computer may read or change it (mode {mode:04o})"
+        raise MachineFileError(f"link.{field}: {path}: {open_to}; protect it with: chmod 600 {path}")
     return _text(field, path)
 
 
@@ -233,10 +219,8 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
     def _no_secrets(cls, fields: Any) -> Any:  # whatever the file has; checked field by field afterwards
         for name in _SECRETS.keys() & fields.keys() if isinstance(fields, dict) else ():
             # Raised here, so that the value is in no message.
-            raise ValueError(
-                f"{name} does not belong in settings, which many may read: put it into a file of mode 600 and name "
-                f"that in {_SECRETS[name]}"
-            )
+            instead = f"put it into a file of mode 600 and name that in {_SECRETS[name]}"
+            raise ValueError(f"{name} does not belong in settings, which many may read: {instead}")
         return fields
 
     @model_validator(mode="after")
@@ -289,7 +273,11 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         }
         if self.namespace:
             items["namespace"] = json.dumps(self.namespace)
-        return items | self._tls_items() | self._password_items() | self._access_items()
+        items |= self._tls_items() | self._password_items()
+        if self.grants:
+            rules = access_control(self.grants, "cert_common_names" if self.passwords_file is None else "usernames")
+            items["access_control"] = json.dumps(rules)
+        return items
 
     def explain(self, error: str) -> str:
         """Why a session could not be opened, in plain words.
@@ -306,17 +294,13 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         """Possible reasons why no endpoint accepted this program, in a sentence."""
         reasons = []
         if self.user is not None:
-            where = (
-                f"environment variable {self.password_variable}" if self.password_file is None else self.password_file
-            )
+            where = self.password_file or f"environment variable {self.password_variable}"
             reasons.append(f"the other side does not accept the user {self.user} with the password in {where}")
         else:
             reasons.append("the other side requires a user name, and link.user has none")
         if self._encrypted(self.connect) and self.tls is not None:
-            reasons.append(
-                f"the other side's certificate was not issued by {self.tls.root_certificate}, has expired, or is for "
-                "another name than the endpoint's"
-            )
+            invalid = f"was not issued by {self.tls.root_certificate}, has expired"
+            reasons.append(f"the other side's certificate {invalid}, or is for another name than the endpoint's")
             if self.tls.mutual:
                 reasons.append(f"{self.tls.certificate} was not issued by the authority trusted there, or has expired")
             else:
@@ -395,21 +379,16 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
 
     def _password(self) -> str:
         if self.password_file is not None:
-            return _password_in(self.password_file)
+            lines = _secret("password_file", self.password_file).splitlines()
+            if len(lines) != 1 or not lines[0].strip():
+                found = f"expected one line with the password, found {len(lines)} lines"
+                raise MachineFileError(f"link.password_file: {self.password_file}: {found}")
+            return lines[0].strip()
         password = os.environ.get(self.password_variable or "", "")
         if not password:
-            raise MachineFileError(
-                f"link.password_variable: the environment variable {self.password_variable} is empty or not "
-                f"set, expected the password of user {self.user}"
-            )
+            empty = f"the environment variable {self.password_variable} is empty or not set"
+            raise MachineFileError(f"link.password_variable: {empty}, expected the password of user {self.user}")
         return password
-
-    def _access_items(self) -> dict[str, str]:
-        if not self.grants:
-            return {}
-        known_by: Literal["usernames", "cert_common_names"]
-        known_by = "cert_common_names" if self.passwords_file is None else "usernames"
-        return {"access_control": json.dumps(access_control(self.grants, known_by))}
 
 
 class _LinkFile(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):

@@ -18,6 +18,7 @@ complete, or with `RecordingWriter.flush`; from then on its messages survive the
 
 import os
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -38,8 +39,6 @@ _CHUNK_BYTES = 256 * 1024
 _LENGTH = struct.Struct("<I")
 _RECORD_HEAD = 1 + 8  # bytes before a record's contents in the file: its kind and its length
 _PLAIN, _PREFIXED = "none", "attachment-1"
-_LIBRARY = "rotorwatch"
-_PROFILE = "rotorwatch-1"
 # What the mcap library lets through when a file is cut off or overwritten.
 DAMAGE = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, ValueError, KeyError, EOFError, MemoryError)
 
@@ -102,7 +101,7 @@ class RecordingWriter:
             self._file = self.part.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             try:
-                self._writer.start(profile=_PROFILE, library=_LIBRARY)
+                self._writer.start(profile="rotorwatch-1", library="rotorwatch")
                 self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
                 self._hand_over()
             except OSError:  # the disk is full: no empty file stays behind
@@ -117,10 +116,9 @@ class RecordingWriter:
 
     def write(self, message: RecordedMessage) -> None:
         """Append a message."""
-        framing = _PREFIXED if message.attachment else _PLAIN
-        data = message.payload
+        framing, data = _PLAIN, message.payload
         if message.attachment:
-            data = _LENGTH.pack(len(message.attachment)) + message.attachment + message.payload
+            framing, data = _PREFIXED, _LENGTH.pack(len(message.attachment)) + message.attachment + message.payload
         with writing(self.part):
             channel = self._channel(message.key, message.encoding, framing)
             sequence = self._counts[channel]
@@ -244,10 +242,9 @@ def summarize_recording(path: Path) -> RecordingSummary:
         summary = make_reader(file, validate_crcs=True).get_summary()
         if summary is None or summary.statistics is None:
             raise RecordingError(f"{path}: the recording has no index")
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for number, count in summary.statistics.channel_message_counts.items():
-            key = summary.channels[number].topic
-            counts[key] = counts.get(key, 0) + count
+            counts[summary.channels[number].topic] += count
         found = summary.statistics
         return RecordingSummary(path, found.message_start_time, found.message_end_time, counts)
 
@@ -265,9 +262,8 @@ def unpacked(channel: Channel, message: Message) -> RecordedMessage:
         attachment, payload = message.data[_LENGTH.size : end], message.data[end:]
     elif framing != _PLAIN:
         raise ValueError(f"framing {framing!r} on {channel.topic} is not {_PLAIN!r} or {_PREFIXED!r}")
-    return RecordedMessage(
-        channel.topic, bytes(payload), bytes(attachment), encoding, message.log_time, message.publish_time
-    )
+    times_ns = message.log_time, message.publish_time
+    return RecordedMessage(channel.topic, bytes(payload), bytes(attachment), encoding, *times_ns)
 
 
 @contextmanager

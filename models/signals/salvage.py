@@ -1,5 +1,6 @@
 """Recovery: what can still be read of a recording whose writer was killed, or that was damaged later."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, r
 class Salvage:
     """What was recovered from a damaged recording, and what was lost."""
 
-    messages: dict[str, int] = field(default_factory=dict)  # number of messages recovered, by key
+    messages: Counter[str] = field(default_factory=Counter)  # number of messages recovered, by key
     # Earliest and latest log time recovered; both 0 if nothing was.
     start_ns: int = 0
     end_ns: int = 0
@@ -31,7 +32,7 @@ class Salvage:
     @property
     def count(self) -> int:
         """Number of messages recovered."""
-        return sum(self.messages.values())
+        return self.messages.total()
 
     @property
     def unaccounted_s(self) -> float:
@@ -75,13 +76,7 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
 
 
 def inspect_recording(path: Path) -> Salvage:
-    """Read a recording from end to end and say what can be read of it.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be opened.
-    """
+    """Read a recording from end to end and say what can be read of it; `RecordingError` if it cannot be opened."""
     salvage = _nothing_yet(path)
     for _ in _salvaged(path, salvage):
         pass
@@ -91,10 +86,7 @@ def inspect_recording(path: Path) -> Salvage:
 def salvaged_messages(path: Path) -> Iterator[RecordedMessage]:
     """Messages that can be read of a recording, cut off or not, in the order in which they were written.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be opened.
+    Raises `RecordingError` if it cannot be opened.
     """
     return _salvaged(path, _nothing_yet(path))
 
@@ -126,7 +118,10 @@ def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:
                         salvage.unnamed_messages += 1
                         continue
                     message = unpacked(channels[inner.channel_id], inner)
-                    _enter(message, salvage)
+                    time_ns = message.log_time_ns
+                    salvage.start_ns = min(salvage.start_ns, time_ns) if salvage.messages else time_ns
+                    salvage.end_ns = max(salvage.end_ns, time_ns)
+                    salvage.messages[message.key] += 1
                     yield message
         salvage.lost_bytes -= file.tell() - begin
         salvage.complete = not salvage.damaged_chunks
@@ -149,10 +144,3 @@ def _content(record: McapRecord) -> list[McapRecord] | None:
         return breakup_chunk(record, validate_crc=True)
     except DAMAGE:
         return None
-
-
-def _enter(message: RecordedMessage, salvage: Salvage) -> None:
-    time_ns = message.log_time_ns
-    salvage.start_ns = min(salvage.start_ns, time_ns) if salvage.messages else time_ns
-    salvage.end_ns = max(salvage.end_ns, time_ns)
-    salvage.messages[message.key] = salvage.messages.get(message.key, 0) + 1

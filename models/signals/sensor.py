@@ -38,25 +38,18 @@ class Sensor(Channel):
         return fields.model_dump() if isinstance(fields, Channel) else fields
 
     @model_validator(mode="after")
-    def _vector(self) -> Self:
+    def _consistent(self) -> Self:
         names = ("slow_roll_um_pp", "slow_roll_phase_lag_deg")
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) == 1:
             (other,) = set(names) - set(given)
             raise ValueError(f"channel {self.name}: {given[0]} is given without {other}: a vector needs both")
         if given and self.quantity is not Quantity.DISPLACEMENT:
-            raise ValueError(
-                f"channel {self.name}: slow_roll_um_pp is {self.slow_roll_um_pp:g}, but run-out is that of a "
-                f"displacement, and this measures {self.quantity}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _signal(self) -> Self:
+            why = f"run-out is that of a displacement, and this measures {self.quantity}"
+            raise ValueError(f"channel {self.name}: slow_roll_um_pp is {self.slow_roll_um_pp:g}, but {why}")
         if self.high_pass_order is not None and self.high_pass_hz is None:
-            raise ValueError(
-                f"channel {self.name}: high_pass_order is {self.high_pass_order} without high_pass_hz, its corner"
-            )
+            order = f"high_pass_order is {self.high_pass_order}"
+            raise ValueError(f"channel {self.name}: {order} without high_pass_hz, its corner")
         given = [name for name in ("high_pass_hz", "delay_us") if getattr(self, name) is not None]
         if given and self.quantity is Quantity.SHAFT_ANGLE:
             raise ValueError(f"channel {self.name}: {given[0]} is given, but this measures {self.quantity}")

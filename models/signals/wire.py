@@ -22,9 +22,9 @@ from models.signals.block import SampleBlock
 _CONTINUES = b"\xff\xff\xff\xff"
 _SCHEMA, _RECORD_BATCH = 1, 3
 _FLOATING_POINT, _FIXED_SIZE_LIST = 3, 16
-_PRECISIONS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<f8")}
+# By the number that stands for a type, in the raw header as in Arrow's schemas.
+_DTYPES: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<f8")}
 _MOST_ENTRIES = 64
-_FIELD_NODE, _BUFFER = 16, 16
 _COLUMN = "expected a single column 'samples' of fixed-size lists of float32 or float64"
 
 
@@ -55,7 +55,8 @@ def _read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
         kind, batch, body, _ = _message(stream, after)
         if kind != _RECORD_BATCH:
             raise WireError("Arrow stream has no record batch after the schema")
-        return _values(stream, batch, body, dtype, n_channels), _metadata(schema)
+        samples = _values(stream, batch, body, dtype, n_channels)
+        return samples, {_text(one, 4).decode("utf-8", "replace"): _text(one, 6) for one in _entries(schema, 8)}
     except (struct.error, ValueError, TypeError, IndexError, OverflowError) as error:
         raise WireError(f"Arrow stream is damaged: {error}") from error
 
@@ -111,15 +112,11 @@ def _column(schema: Table) -> tuple[np.dtype[Any], int]:
     kinds_of = [one.GetSlot(8, 0, kinds.Uint8Flags) for one in (field, *children)]
     if kinds_of != [_FIXED_SIZE_LIST, _FLOATING_POINT] or any(one.Offset(12) for one in (field, *children)):
         raise WireError(f"Arrow column 'samples' has types {kinds_of}; {_COLUMN}")
-    dtype = _PRECISIONS.get(_child(children[0], 10).GetSlot(4, 0, kinds.Int16Flags))
+    dtype = _DTYPES.get(_child(children[0], 10).GetSlot(4, 0, kinds.Int16Flags))
     n_channels: int = _child(field, 10).GetSlot(4, 0, kinds.Int32Flags)
     if dtype is None or n_channels < 1:
         raise WireError(f"Arrow column 'samples' has lists of {n_channels}; {_COLUMN}")
     return dtype, n_channels
-
-
-def _metadata(schema: Table) -> dict[str, bytes]:
-    return {_text(entry, 4).decode("utf-8", "replace"): _text(entry, 6) for entry in _entries(schema, 8)}
 
 
 def _values(
@@ -129,7 +126,7 @@ def _values(
     if batch.Offset(10):
         raise WireError("Arrow record batch is compressed, expected uncompressed")
     n_samples: int = batch.GetSlot(4, 0, kinds.Int64Flags)
-    nodes, buffers = (_structs(batch, slot, size) for slot, size in ((6, _FIELD_NODE), (8, _BUFFER)))
+    nodes, buffers = _structs(batch, 6), _structs(batch, 8)
     if [length for length, _ in nodes] != [n_samples, n_samples * n_channels] or len(buffers) != 3:
         raise WireError(f"Arrow record batch of {n_samples} rows does not hold lists of {n_channels}")
     nulls = sum(count for _, count in nodes)
@@ -143,13 +140,13 @@ def _values(
     return np.frombuffer(stream, dtype, count, start).reshape(n_samples, n_channels)
 
 
-def _structs(table: Table, slot: int, size: int) -> list[tuple[int, int]]:
-    """The entries of a vector of structs, each of two 64-bit numbers."""
+def _structs(table: Table, slot: int) -> list[tuple[int, int]]:
+    """The entries of a vector of structs (field nodes or buffers), each of two 64-bit numbers."""
     offset = table.Offset(slot)
     if offset == 0 or table.VectorLen(offset) > _MOST_ENTRIES:
         raise WireError("Arrow record batch lacks its lists of lengths or buffers, or has too many")
     start = table.Vector(offset)
-    return [struct.unpack_from("<qq", table.Bytes, start + size * at) for at in range(table.VectorLen(offset))]
+    return [struct.unpack_from("<qq", table.Bytes, start + 16 * at) for at in range(table.VectorLen(offset))]
 
 
 BLOCK_ENCODING = "application/x-rotorwatch-block"
@@ -157,7 +154,6 @@ ARROW_ENCODING = "application/vnd.apache.arrow.stream"
 REPLAY_MARK = ";replay"  # ends the encoding of a block that is replayed on a machine's own keys
 _HEADER = struct.Struct("<qQdBBHI")  # start_ns, sequence, rate_hz, dtype, channels, run, samples
 HEADER_BYTES = _HEADER.size
-_DTYPES: dict[int, np.dtype[np.float32] | np.dtype[np.float64]] = {1: np.dtype("<f4"), 2: np.dtype("<f8")}
 _DTYPE_CODES = {"f4": 1, "f8": 2}
 _MAX_SAMPLES, _MAX_CHANNELS = 1_000_000, 64
 _SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e6
@@ -203,7 +199,9 @@ def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[Samp
     if kind == BLOCK_ENCODING:
         return _decode_raw(payload, attachment), schema_hash
     if kind == ARROW_ENCODING:
-        return _decode_arrow(payload), schema_hash
+        samples, metadata = _read_arrow(payload)
+        numbers = {field: _metadata_number(metadata, field) for field in _ARROW_FIELDS}
+        return _checked(**numbers, samples=samples), schema_hash
     raise WireError(f"encoding {encoding[:_LONGEST_TEXT]!r} is not {BLOCK_ENCODING!r} or {ARROW_ENCODING!r}")
 
 
@@ -218,7 +216,7 @@ def may_be_block(payload: bytes, attachment: bytes, encoding: str, n_channels: i
     most = n_channels * most_samples * 8
     kind = encoding.partition(";")[0]
     if kind == ARROW_ENCODING:
-        return payload.startswith(b"\xff\xff\xff\xff") and len(payload) <= most + _ARROW_OVERHEAD
+        return payload.startswith(_CONTINUES) and len(payload) <= most + _ARROW_OVERHEAD
     if kind != BLOCK_ENCODING or len(attachment) != HEADER_BYTES:
         return False
     _, _, _, code, channels, _, n_samples = _HEADER.unpack(attachment)
@@ -235,17 +233,10 @@ def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
     expected = n_samples * n_channels * _DTYPES[code].itemsize
     _check_shape(n_samples, n_channels)
     if len(payload) != expected:
-        raise WireError(
-            f"payload has {len(payload)} bytes, expected {expected} for {n_samples} samples × {n_channels} channels"
-        )
+        shape = f"{n_samples} samples × {n_channels} channels"
+        raise WireError(f"payload has {len(payload)} bytes, expected {expected} for {shape}")
     samples: npt.NDArray[Any] = np.frombuffer(payload, dtype=_DTYPES[code]).reshape(n_samples, n_channels)
     return _checked(start_ns, sequence, run, rate_hz, samples)
-
-
-def _decode_arrow(payload: bytes) -> SampleBlock:
-    samples, metadata = _read_arrow(payload)
-    numbers = {field: _metadata_number(metadata, field) for field in _ARROW_FIELDS}
-    return _checked(**numbers, samples=samples)
 
 
 def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary, commission
+from models.commissioning.commission import Commissioning, CommissioningReport, commission
 from models.commissioning.commissioned import FILE, Commissioned, HealthyEntry, load_commissioned
 from models.commissioning.healthy import HealthyRecording, read_healthy
 from models.diagnosis.networks.bundle import MANIFEST, load_bundle
@@ -42,7 +42,13 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
     verdict.highlight_words([VERDICT_TEXT[report.verdict]], style=_COLOURS[report.verdict])
     console.print(verdict)
     console.print(Text(f"knowledge level {report.level.value}: {report.level_text}"))
-    console.print(_checks(report, narrow=console.width < _WIDE))
+    checks = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    checks.add_column(no_wrap=True)
+    checks.add_column(max_width=20 if console.width < _WIDE else None)
+    checks.add_column(ratio=1)
+    for check in report.checks:
+        checks.add_row(Text(check.verdict, style=_COLOURS[check.verdict]), Text(check.name), Text(check.text))
+    console.print(checks)
     if report.parameters:
         console.print(_parameters(report))
         for sentence in budget_sentences(report):
@@ -52,16 +58,6 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
     console.print(Text("\nWhat to do next", style="bold"))
     for number, step in enumerate(next_steps(report), start=1):
         console.print(Padding(Text(f"{number}. {step}"), (0, 0, 0, 2)))
-
-
-def _checks(report: CommissioningReport, *, narrow: bool) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column(max_width=20 if narrow else None)
-    table.add_column(ratio=1)
-    for check in report.checks:
-        table.add_row(Text(check.verdict, style=_COLOURS[check.verdict]), Text(check.name), Text(check.text))
-    return table
 
 
 def _parameters(report: CommissioningReport) -> Table:
@@ -82,19 +78,13 @@ def _parameters(report: CommissioningReport) -> Table:
     for head in ("loss", "gain"):
         table.add_column(head, justify="right")
     for one in report.parameters:
-        table.add_row(*_cells(one, identified=identified))
+        cells = ["not readable"]
+        if one.evaluable:
+            value = "" if one.identified is None else parameter_value(one.name, one.identified)
+            errors = ["–" if error is None else percent(error) for error in (one.window_error, one.commissioning_error)]
+            cells = [*([value] if identified else []), *errors, dominant(one), *smallest_change(one)]
+        table.add_row(*map(Text, (one.name, *cells)))
     return table
-
-
-def _cells(one: ParameterSummary, *, identified: bool) -> list[Text]:
-    if not one.evaluable:
-        return [Text(one.name), Text("not readable")]
-    value = [Text("" if one.identified is None else parameter_value(one.name, one.identified))] if identified else []
-    errors = [Text("–" if error is None else percent(error)) for error in (one.window_error, one.commissioning_error)]
-    return [Text(one.name), *value, *errors, Text(dominant(one)), *map(Text, smallest_change(one))]
-
-
-_KEPT = "commissioned-{version}.json"
 
 
 def commission_machine(
@@ -121,8 +111,10 @@ def commission_machine(
     RotorwatchError
         If machine file, recordings or directory cannot be used.
     """
-    machine = load_machine_file(name)
-    _check_names(healthy)
+    machine, names = load_machine_file(name), [path.name for path in healthy]
+    for path in healthy:
+        if names.count(path.name) > 1:  # names identify the recordings in the report and in the bundle
+            raise MachineFileError(f"--healthy {path}: two recordings are called {path.name}, expected different names")
     replaces = _load_replaced(out, machine, why)
     with labelled_bars() as progress:
         recordings = []
@@ -142,14 +134,6 @@ def commission_machine(
     if made.commissioned is not None:
         typer.echo(f"bundle: {out}   (rotorwatch run --machine {name}@{out})")
     return made.commissioned is not None
-
-
-def _check_names(paths: Sequence[Path]) -> None:
-    """Refuse equal file names, because these identify the recordings in the report and in the bundle."""
-    names = [path.name for path in paths]
-    for path in paths:
-        if names.count(path.name) > 1:
-            raise MachineFileError(f"--healthy {path}: two recordings are called {path.name}, expected different names")
 
 
 def _load_replaced(out: Path, machine: MachineFile, why: str) -> Commissioned | None:
@@ -188,14 +172,9 @@ def _remove_networks(out: Path, machine: Machine) -> str:
 def _entry(path: Path, recording: HealthyRecording) -> HealthyEntry:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    hops = recording.hops
+    start_ns, end_ns, used_s = recording.hops[0].start_ns, recording.hops[-1].end_ns, recording.duration_s
     return HealthyEntry(
-        name=path.name,
-        sha256=digest,
-        start_ns=hops[0].start_ns,
-        end_ns=hops[-1].end_ns,
-        used_s=recording.duration_s,
-        gaps=recording.gaps,
+        name=path.name, sha256=digest, start_ns=start_ns, end_ns=end_ns, used_s=used_s, gaps=recording.gaps
     )
 
 
@@ -205,7 +184,7 @@ def _write(out: Path, made: Commissioning, replaces: Commissioned | None) -> Non
         if made.commissioned is None:
             return
         if replaces is not None:
-            shutil.copyfile(out / FILE, out / _KEPT.format(version=replaces.version))
+            shutil.copyfile(out / FILE, out / f"commissioned-{replaces.version}.json")
         if made.machine is not None and (why := _remove_networks(out, made.machine)):
             typer.echo(f"the networks that were there cannot be used and were removed: {why}")
         draft = out / (FILE + ".new")  # the old file stays intact until the new one is complete

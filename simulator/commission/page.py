@@ -1,10 +1,10 @@
 """The commissioning report on one page: HTML with its pictures inside, and the same figures as JSON."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
@@ -30,8 +30,7 @@ _COMPARED = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class ReportPicture:
+class ReportPicture(NamedTuple):
     """A picture with its title and caption."""
 
     title: str
@@ -80,19 +79,15 @@ def _spectra_caption(portraits: Sequence[Portrait]) -> str:
     else:
         text += "The speed is not known, so the rotation is neither marked nor taken out."
     if any(one.lines for one in portraits):
-        text += (
-            " A frequency in orange is a steady line that does not belong to the rotation, at the channel where it is "
-        )
-        text += "strongest."
+        where = "at the channel where it is strongest"
+        text += f" A frequency in orange is a steady line that does not belong to the rotation, {where}."
     return text
 
 
 def _levels_caption(portraits: Sequence[Portrait]) -> str:
     hop_s = portraits[0].statistics.duration_s / portraits[0].levels.shape[0]
-    text = (
-        f"A point every {hop_s:g} s; the level is that of the random vibration without the rotation, over the median "
-        "of all recordings."
-    )
+    what = "the level is that of the random vibration without the rotation, over the median of all recordings"
+    text = f"A point every {hop_s:g} s; {what}."
     if any(one.broken.any() for one in portraits):
         text += " A line is broken where data are missing."
     if len(portraits) > 1:
@@ -101,7 +96,6 @@ def _levels_caption(portraits: Sequence[Portrait]) -> str:
 
 
 HTML, JSON = "report.html", "report.json"
-_TEMPLATE = "report.html.jinja"
 _RPM = 30 / np.pi
 _KNOWN = (
     "The rotor is known, so every parameter is read by comparing the measured spectra as a whole with theory. The "
@@ -127,12 +121,7 @@ def write_report(
     """Write ``report.html``, whose path is returned, and ``report.json``.
 
     `commissioned`, if it was stored, tells what it replaces and why, and the hash of each recording. The same arguments
-    give the same page, to the last byte.
-
-    Raises
-    ------
-    RecordingError
-        If they cannot be written.
+    give the same page, to the last byte. Raises `RecordingError` if they cannot be written.
     """
     text = _render(report, recordings, "" if machine is None else machine.description, commissioned)
     page = directory / HTML
@@ -152,16 +141,11 @@ def _render(
     commissioned: Commissioned | None,
 ) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {
-        "percent": verdict.percent,
-        "duration": verdict.duration,
-        "channel": verdict.channel_text,
-        "listed": verdict.listed,
-    }
-    template = resources.files("simulator.commission").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    environment.filters |= {"percent": verdict.percent, "duration": verdict.duration}
+    template = resources.files("simulator.commission").joinpath("report.html.jinja").read_text(encoding="utf-8")
     portraits = [portrait(number, one) for number, one in enumerate(recordings, start=1)]
     turned = None if report.conditions is None else report.conditions.speed_rpm
-    hashes = {} if commissioned is None else {one.name: one.sha256 for one in commissioned.recordings}
+    words = {word.strip(",;") for one in report.equations for word in one.reason.split()}  # some of them are symbols
     return environment.from_string(template).render(
         report=report,
         description=description,
@@ -170,20 +154,14 @@ def _render(
         identified=any(one.identified is not None for one in report.parameters),
         wished=sorted({one.wished for one in report.parameters if one.wished is not None}),
         equations_text=_EQUATIONS[report.level],
-        symbols=_symbols(report),
+        symbols=[(word, text) for word in sorted(words) if (text := verdict.channel_text(word)) != word],
         pictures=pictures_of(report, [one.name for one in recordings], [one for one in portraits if one is not None]),
         speed_range="" if turned is None else _speeds(turned),
         levels=_levels(report),
         growths=_growths(report),
         recordings=[_row(*pair) for pair in zip(recordings, portraits, strict=True)],
-        hashes=hashes,
+        hashes={} if commissioned is None else {one.name: one.sha256 for one in commissioned.recordings},
     )
-
-
-def _symbols(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
-    """Symbols of quantities in the table of equations, each with its meaning in words."""
-    words = {word.strip(",;") for one in report.equations for word in one.reason.split()}
-    return tuple((word, verdict.channel_text(word)) for word in sorted(words) if verdict.channel_text(word) != word)
 
 
 def _between(low: str, high: str) -> str:
@@ -212,9 +190,8 @@ def _growths(report: CommissioningReport) -> tuple[tuple[str, ...], ...]:
     found = []
     for one in report.levels:
         state = "any" if one.speed_rpm is None else _speeds(one.speed_rpm)
-        healthy, alert = (
-            f"{verdict.significant(edge, 3)} {unit_in_text(one.unit)}" for edge in (one.healthy, one.alert)
-        )
+        unit = unit_in_text(one.unit)
+        healthy, alert = (f"{verdict.significant(edge, 3)} {unit}" for edge in (one.healthy, one.alert))
         growth = "–" if one.growth is None else f"{100 * one.growth:.0f}%"
         found.append((state, str(one.windows), one.channel, one.measure, healthy, alert, growth))
     return tuple(found)

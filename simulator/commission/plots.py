@@ -155,18 +155,13 @@ def draw_budget(report: CommissioningReport) -> Figure | None:
             label="commissioning (part of every later interval)",
         )  # fmt: skip
     axes.plot(total, y, linestyle="", marker="|", markersize=15, markeredgewidth=2, color=INK, label="both together")
-    limits = [(at, _allowed(one)) for at, one in enumerate(read)]
-    known = [(at, limit) for at, limit in limits if limit is not None]
+    known = [(at, limit) for at, one in enumerate(read) if (limit := _allowed(one)) is not None]
     if known:
         sizes = sorted({one.wished for one in read if one.wished is not None})
+        label = f"at most this to find the wished change of {' or '.join(percent(size) for size in sizes)}"
+        at, allowed = (np.array(part) for part in zip(*known, strict=True))
         axes.vlines(
-            [limit for _, limit in known],
-            [at - 0.42 for at, _ in known],
-            [at + 0.42 for at, _ in known],
-            color=COLOURS[2],
-            linewidth=2.2,
-            linestyle=(0, (3, 1.2)),
-            label=f"at most this to find the wished change of {' or '.join(percent(size) for size in sizes)}",
+            allowed, at - 0.42, at + 0.42, color=COLOURS[2], linewidth=2.2, linestyle=(0, (3, 1.2)), label=label
         )
     axes.set_xscale("log")
     low = min([*own, *shared[shared > 0], *(limit for _, limit in known)])

@@ -19,7 +19,7 @@ _STYLES = ("-", "--", ":")
 _BEYOND_BAND = 0.04
 _NEAR, _LINE = 0.04, 0.003  # of the width of the picture: speeds that share a mark, and a mark that is drawn as a line
 _PLACES = ("y1", "z1", "y2", "z2", "psi", "phi")
-_ORDERS = ("", "_dot", "_ddot")
+_ORDERS = ("", "dot", "ddot")
 _RPM = 30 / np.pi
 
 
@@ -58,28 +58,22 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
         every /= recording.plan.equaliser.response(recording.plan.frequencies_hz)
     power = np.mean(np.abs(every) ** 2, axis=0)
     starts = np.array([hop.start_ns for hop in hops], dtype=np.int64)
-    first = [len(stretch) for stretch in recording.stretches]
     broken = np.zeros(len(hops), dtype=np.bool_)
-    broken[np.cumsum(first)[:-1]] = True
-    return Portrait(
-        number=number,
-        statistics=statistics,
-        density=np.asarray(np.sqrt(2 * power), dtype=np.float64),
-        time_s=(starts - starts[0]) / 1e9 + recording.plan.hop / recording.plan.rate_hz / 2,
-        broken=broken,
-        lines=foreign_lines(recording),
-    )
+    broken[np.cumsum([len(stretch) for stretch in recording.stretches])[:-1]] = True
+    density = np.asarray(np.sqrt(2 * power), dtype=np.float64)
+    time_s = (starts - starts[0]) / 1e9 + recording.plan.hop / recording.plan.rate_hz / 2
+    return Portrait(number, statistics, density, time_s, broken, foreign_lines(recording))
 
 
 def ordered(states: Iterable[str]) -> list[str]:
     """Bearing before disc, displacement before velocity, the two planes side by side."""
-    return sorted(states, key=_rank)
 
+    def rank(state: str) -> tuple[int, int, int]:
+        place, _, ending = state.partition("_")
+        at = _number(place)
+        return at // 2, _ORDERS.index(ending), at % 2
 
-def _rank(state: str) -> tuple[int, int, int]:
-    place, _, ending = state.partition("_")
-    at = _number(place)
-    return at // 2, _ORDERS.index(f"_{ending}" if ending else ""), at % 2
+    return sorted(states, key=rank)
 
 
 def _number(place: str) -> int:
@@ -134,11 +128,8 @@ def _spectrum(axes: Axes, state: str, portraits: Sequence[Portrait]) -> None:
 
 def _line(number: int) -> dict[str, str | float]:
     at = number - 1
-    return {
-        "color": COLOURS[at % len(COLOURS)],
-        "linestyle": _STYLES[at // len(COLOURS) % len(_STYLES)],
-        "linewidth": 0.9,
-    }
+    style = _STYLES[at // len(COLOURS) % len(_STYLES)]
+    return {"color": COLOURS[at % len(COLOURS)], "linestyle": style, "linewidth": 0.9}
 
 
 def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float) -> None:
@@ -196,11 +187,18 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
             panels[-1].plot(*_pieces(x, ratio, one.broken), label=channel_text(state), **_channel_line(state))
         start_s += float(one.time_s[-1]) + half_s + space_s
     if speeds_known:
+        rpm = _RPM * np.concatenate([one.statistics.hop_speed_rad_s for one in portraits])
+        low, high = float(np.nanmin(rpm)), float(np.nanmax(rpm))
+        middle, reach = (low + high) / 2, (high - low) / 2
+        reach = max(1.2 * reach, 0.01 * abs(middle), 0.1)  # a steady speed must look steady
         panels[0].set_ylabel("speed, rpm")
-        panels[0].set_ylim(*_speed_limits(portraits))
+        panels[0].set_ylim(middle - reach, middle + reach)
+    ratios = np.concatenate([one.levels for one in portraits]) / np.maximum(reference, np.finfo(float).tiny)
+    seen = ratios[np.isfinite(ratios) & (ratios > 0)]
+    low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0, 1.0)
     panels[-1].set_ylabel("level (rms) over its median")
     panels[-1].set_yscale("log", base=2)
-    panels[-1].set_ylim(*_level_limits(portraits, reference))
+    panels[-1].set_ylim(min(0.45, low / 1.2), max(2.2, high * 1.2))
     panels[-1].yaxis.set_major_formatter(lambda value, _: f"{value:g}×")
     panels[-1].set_xlabel(f"time from the beginning of each recording, one after the other, {unit}")
     handles, labels = panels[-1].get_legend_handles_labels()
@@ -219,27 +217,5 @@ def _pieces(
 
 def _channel_line(state: str) -> dict[str, str | float]:
     place, _, ending = state.partition("_")
-    return {
-        "color": COLOURS[_number(place)],
-        "linestyle": _STYLES[_ORDERS.index(f"_{ending}" if ending else "")],
-        "marker": ".",
-        "markersize": 3,
-        "linewidth": 1.0,
-    }
-
-
-def _speed_limits(portraits: Sequence[Portrait]) -> tuple[float, float]:
-    """Limits of the axis of speeds, at least two per cent apart: a steady speed must look steady."""
-    rpm = _RPM * np.concatenate([one.statistics.hop_speed_rad_s for one in portraits])
-    low, high = float(np.nanmin(rpm)), float(np.nanmax(rpm))
-    middle, reach = (low + high) / 2, (high - low) / 2
-    reach = max(1.2 * reach, 0.01 * abs(middle), 0.1)
-    return middle - reach, middle + reach
-
-
-def _level_limits(portraits: Sequence[Portrait], reference: FloatArray) -> tuple[float, float]:
-    """Limits of the axis of levels: at least half to double."""
-    ratios = np.concatenate([one.levels for one in portraits]) / np.maximum(reference, np.finfo(float).tiny)
-    seen = ratios[np.isfinite(ratios) & (ratios > 0)]
-    low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0, 1.0)
-    return min(0.45, low / 1.2), max(2.2, high * 1.2)
+    line = {"color": COLOURS[_number(place)], "linestyle": _STYLES[_ORDERS.index(ending)]}
+    return {**line, "marker": ".", "markersize": 3, "linewidth": 1.0}

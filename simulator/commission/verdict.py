@@ -163,9 +163,8 @@ def headline(report: CommissioningReport) -> str:
     """Verdict in one sentence."""
     place = f"{report.site}/{report.machine}"
     if report.verdict == "refused":
-        reasons = [check.text for check in report.checks if check.verdict == "refused"] or [
-            check.text for check in report.checks if check.verdict == "limited"
-        ]
+        refused, limited = ([c.text for c in report.checks if c.verdict == each] for each in ("refused", "limited"))
+        reasons = refused or limited
         return f"{place} is not commissioned: {'; '.join(reasons) or report.summary}."
     read = [parameter.name for parameter in report.parameters if parameter.evaluable]
     if read:
@@ -183,24 +182,16 @@ def headline(report: CommissioningReport) -> str:
 
 def next_steps(report: CommissioningReport) -> tuple[str, ...]:
     """What to do next, most urgent first."""
-    advice = tuple(
-        dict.fromkeys(
-            check.advice
-            for verdict in ("refused", "limited")
-            for check in report.checks
-            if check.verdict == verdict and check.advice
-        )
-    )
+    ordered = sorted(report.checks, key=lambda check: check.verdict != "refused")
+    advice = dict.fromkeys(check.advice for check in ordered if check.verdict != "passed" and check.advice)
+    steps = [f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}" for text in advice]
     if report.verdict == "refused":
-        return (*(_sentence(one) for one in advice), "Nothing was stored: the monitor cannot be started from this.")
-    steps = [_sentence(one) for one in advice]
+        return (*steps, "Nothing was stored: the monitor cannot be started from this.")
     steps.append("Start the monitor with the machine file and this bundle: rotorwatch run --machine FILE@BUNDLE.")
     short = [one.name for one in report.parameters if dominant(one) == "commissioning"]
     if short:
-        steps.append(
-            f"For sharper readings of {listed(short)}, commission again from more healthy data: what was learned is "
-            "less certain than one window."
-        )
+        why = "what was learned is less certain than one window"
+        steps.append(f"For sharper readings of {listed(short)}, commission again from more healthy data: {why}.")
     steps.append("Commission again after a repair, rebalancing or a change of sensors, and for other speeds or loads.")
     return tuple(steps)
 
@@ -229,9 +220,12 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
             names = [one.name for one in read if dominant(one) == which]
             if names:
                 told.append(text.format(listed(names)))
-    found = [one for one in read if _found_already(one)]
-    if found:
-        sizes = {one.name: one.wished for one in found}
+    sizes = {}
+    for one in read:
+        loss, gain, size = one.detectable_loss, one.detectable_gain, one.wished
+        if loss is not None and gain is not None and size is not None and max(-loss, gain) <= size:
+            sizes[one.name] = size
+    if sizes:
         wished = listed(percent(size) for size in sorted({size for size in sizes.values() if size}))
         told.append(f"The wished change of {wished} of {listed(sizes)} is found with the present settings.")
     never = [one.name for one in read if one.wished is not None and one.window_s_for_wished is None]
@@ -263,12 +257,3 @@ def growth_sentence(report: CommissioningReport) -> str:
         f"{low if low == high else ends}. A load that is not in the recordings, stronger or from another direction, "
         "makes some channels louder as well and raises alerts."
     )
-
-
-def _found_already(parameter: ParameterSummary) -> bool:
-    loss, gain, wished = parameter.detectable_loss, parameter.detectable_gain, parameter.wished
-    return loss is not None and gain is not None and wished is not None and max(-loss, gain) <= wished
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"

@@ -10,8 +10,7 @@ from models.levels.judgement import LevelJudge, channel_state
 from models.levels.limits import all_rounded
 from models.levels.measures import COMPARED, WindowLevels, level_plan
 from models.levels.reference import FirstWindows, LevelReference, learn_levels
-from models.levels.settings import LevelSettings
-from models.levels.zones import ZONES, zone_of
+from models.levels.settings import ZONES, LevelSettings, zone_of
 from models.signals.channels import Channel
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelLimits
 

@@ -16,8 +16,8 @@ from typer.testing import CliRunner, Result
 from models.commissioning.commissioned import install, load_commissioned
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine, load_machine_file
-from simulator.recorder import record
 from simulator.rotortrain import app
+from simulator.stream import record
 from tests.commissioning.rotor_kit import LAB, stream
 from tests.service.rig.live import machine_file
 

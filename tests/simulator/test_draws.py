@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.studies.subjects.unusual import Anomaly, Excitation, UnusualDraw
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
@@ -10,7 +11,7 @@ from simulator.plant import rotor_in
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
 from simulator.timeline import compile_timeline
-from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 LAB = load_machine("lab")
 
@@ -32,8 +33,8 @@ def _samples(scenario: Scenario) -> FloatArray:
     return np.concatenate([block.samples for block, _ in blocks(scenario, LAB, block_s=1.0)]).astype(np.float64)
 
 
-def _plain(**fields: object) -> Draw:
-    return Draw(LAB, 12, Purpose.EVALUATION, layout=Layout.INDEPENDENT, **fields)  # type: ignore[arg-type]
+def _plain(**fields: object) -> UnusualDraw:
+    return UnusualDraw(LAB, 12, Purpose.EVALUATION, layout=Layout.INDEPENDENT, **fields)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("excitation", list(Excitation)[1:])
@@ -99,7 +100,9 @@ def test_a_crack_is_no_deeper_than_stable_operation_allows() -> None:
     light = light.model_copy(update={"operation": light.operation.model_copy(update={"speed_tolerance": 0.0})})
     nominal = light.operation.model_copy(update={"speed_rpm": 1.11 * light.operation.speed_rpm})
     for machine, depth in ((light, 0.3), (light.model_copy(update={"operation": nominal}), 0.15)):
-        scenario = draw_condition(Draw(machine, 12, Purpose.EVALUATION, anomaly=Anomaly.CRACK, anomaly_size=0.3), 0)
+        scenario = draw_condition(
+            UnusualDraw(machine, 12, Purpose.EVALUATION, anomaly=Anomaly.CRACK, anomaly_size=0.3), 0
+        )
         assert [event.size for event in scenario.events if event.anomaly == "crack"] == [depth]
     deep = scenario.model_copy(update={"events": (*scenario.events, Event(at_s=0, anomaly="crack", size=0.3))})
     with pytest.raises(EstimationError, match=r"machine light: a crack of 0\.3 is unstable, the motion grows"):

@@ -20,7 +20,7 @@ from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import read_equation
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from simulator.training.calibration import calibrate_again
+from simulator.training.command import calibrate_again
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 from tests.sure import sure
@@ -48,7 +48,7 @@ def briefly() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
         patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
-        patch.setattr("simulator.training.calibration._AMORTISED_SHARE", 1)
+        patch.setattr("simulator.training.command._AMORTISED_SHARE", 1)
         patch.setattr("models.diagnosis.networks.calibration._RELATION_FREEDOMS", (4.0,))
         yield
 

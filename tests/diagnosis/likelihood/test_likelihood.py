@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.studies.methods.bound import TrueCondition, cramer_rao
+from benchmarks.studies.subjects.unusual import Anomaly, Excitation, UnusualDraw
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins
 from models.diagnosis.likelihood.scoring import FisherScoring
@@ -21,16 +22,7 @@ from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
 from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
 from simulator.scenario import Event
-from simulator.training.draws import (
-    Anomaly,
-    Draw,
-    Excitation,
-    Layout,
-    Purpose,
-    draw_condition,
-    simulate_scenario,
-    simulate_window,
-)
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario, simulate_window
 from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
 from tests.windows import statistics
@@ -175,7 +167,7 @@ def assert_honest(z: np.ndarray) -> None:
 )
 def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout, excitation: Excitation) -> None:
     faults = {"k_by": -0.2, "c_bz": -0.3, "e": 0.2}
-    draw = Draw(load_machine(name), SEED, Purpose.EVALUATION, int(layout), faults=faults, layout=layout)
+    draw = UnusualDraw(load_machine(name), SEED, Purpose.EVALUATION, int(layout), faults=faults, layout=layout)
     draw = replace(draw, excitation=excitation)
     z, diagnoses = read(draw, range(8), faults)
     assert_honest(z)
@@ -207,11 +199,11 @@ def test_a_single_source_at_a_wandering_speed_is_within_the_model(number: int) -
 
 @pytest.mark.slow
 def test_a_wrong_gain_and_an_added_mass_cause_a_misfit() -> None:
-    gain = Draw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
+    gain = UnusualDraw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
     diagnosis = LikelihoodFit(LAB).diagnose(simulate_window(gain, 0))
     assert (diagnosis.misfit_z or 0) > 5
     assert diagnosis.suspect.startswith("gain of ")
-    mass = Draw(LAB, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
+    mass = UnusualDraw(LAB, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
     assert (LikelihoodFit(LAB).diagnose(simulate_window(mass, 0)).misfit_z or 0) > 3
 
 

@@ -15,7 +15,7 @@ from models.signals.recording import RecordedMessage, RecordingWriter, read_reco
 from service.analysis.recorded import Recorded
 from service.recordings.replay.source import RecordingSource
 from service.stream.worker import MachineWorker
-from simulator.recorder import record
+from simulator.stream import record
 from tests.service.rig.live import LAB, START_NS
 
 NAMES = [channel.name for channel in LAB.sensors]
