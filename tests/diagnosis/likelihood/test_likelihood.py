@@ -209,7 +209,7 @@ def test_a_wrong_gain_and_an_added_mass_cause_a_misfit() -> None:
 
 def test_windows_that_misfit_are_searched_cold_again() -> None:
     """All searches from one wrong maximum may end there: not more than six in a row, and none of a shorter length."""
-    window = simulate_window(Draw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT), 0)
+    window = simulate_window(UnusualDraw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT), 0)
     fit, short = LikelihoodFit(LAB), LikelihoodFit(LAB)
     found = [fit.diagnose(window) for _ in range(6)]
     short.start_near(fit)
