@@ -132,7 +132,7 @@ class BaselineEvaluator(WindowEvaluator):
         whole, misfit_z = test.settings.window_hops, deciding.misfit_z or 0.0
         if misfit_z <= _MOST_MISFIT_Z and test.wanted() == test.settings.short_hops:
             return deciding, found
-        limit, start_ns = test.thresholds(whole).outside, sliding.hops[0].start_ns
+        limit, start_ns = test.settings.thresholds(whole).outside, sliding.hops[0].start_ns
         outside = misfit_z > limit
         before = [one for one in test.state.sums.get(1, ()) if one.end_ns > start_ns and not one.unexplained]
         if outside and not any((one.misfit_z or 0.0) <= limit for one in before):
