@@ -78,7 +78,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape = commissioned.shape
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
-        self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
+        self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
         self.takes_short = self._baselines != ()
 

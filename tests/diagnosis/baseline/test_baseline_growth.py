@@ -10,11 +10,11 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline.conditions import Growth
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.growth import Growth
-from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.baseline.rows import COUPLED_ROWS
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -53,13 +53,13 @@ def test_stiffening_of_a_bearing_under_another_force_is_no_change() -> None:
     reading = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
     assert sure(reading.relative_change) < -0.02  # the weaker motion meets a softer bearing
     assert isolate_window(monitor.diagnose(window), 0.01).changed == ()
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json())
-    assert again.baseline().growth == learned.growth
-    assert again.diagnostician().diagnose(window).parameters == monitor.diagnose(window).parameters
-    older = BaselineRecord.of(replace(learned, growth=()))  # as before growth was recorded
+    again = Baseline.model_validate_json(learned.model_dump_json())
+    assert again.growth == learned.growth
+    assert BaselineDiagnostician(again).diagnose(window).parameters == monitor.diagnose(window).parameters
+    older = learned.model_copy(update={"growth": ()})  # as before growth was recorded
     assert "growth" not in older.model_dump(mode="json")
-    assert older.baseline().growth == ()
-    before = next(one for one in older.diagnostician().diagnose(window).evaluable if one.name == "k_by")
+    assert older.growth == ()
+    before = next(one for one in BaselineDiagnostician(older).diagnose(window).evaluable if one.name == "k_by")
     now = next(one for one in monitor.diagnose(window).evaluable if one.name == "k_by")
     assert before.relative_change == now.relative_change
     assert sure(now.standard_error) > 2 * sure(before.standard_error)
@@ -94,9 +94,8 @@ def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics,
 def test_parameters_that_a_window_does_not_determine_make_no_sensor_suspect() -> None:
     learned, later_windows = with_a_force_that_hides_a_plane()
     # A growth as an earlier version may have stored it makes no sensor suspect either.
-    grown = replace(
-        learned, growth=tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
-    )
+    steep = tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
+    grown = learned.model_copy(update={"growth": steep})
     for baseline_ in (learned, grown):
         monitor = BaselineDiagnostician(baseline_)
         for window in later_windows:
