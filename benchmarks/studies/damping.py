@@ -22,6 +22,7 @@ from benchmarks.studies.reporting.results import Goal, Record, Table, Value
 from benchmarks.studies.reporting.study import Cell, Options, Study
 from benchmarks.studies.subjects.watched import commissioned, raised
 from models.commissioning.commissioned import Installed
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import ROWS, Row
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import to_scale
@@ -82,7 +83,7 @@ def _read(
 ) -> dict[str, Value]:
     """Errors and stated standard errors of the damping readings in the first window, in units of the bound."""
     baselines = () if installed.commissioned is None else installed.commissioned.baselines
-    readings = baselines[0].baseline.diagnostician().diagnose(window).evaluable if baselines else ()
+    readings = BaselineDiagnostician(baselines[0].baseline).diagnose(window).evaluable if baselines else ()
     found: dict[str, Value] = {}
     for one in readings:
         if one.name in _OWN and one.relative_change is not None and one.standard_error is not None:

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.misfit import HealthyMisfit
 from models.diagnosis.networks.bundle import MANIFEST, Bundle, load_bundle
 from models.diagnosis.sensors.reference import Naming, SensorReference
@@ -197,7 +197,7 @@ class ConditionBaseline(BaseModel, extra="forbid", frozen=True):
     """A baseline and the conditions it was learned in."""
 
     conditions: OperatingRange
-    baseline: BaselineRecord
+    baseline: Baseline
 
 
 class Commissioned(BaseModel, extra="forbid", frozen=True):

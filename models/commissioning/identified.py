@@ -71,7 +71,7 @@ def identify(
     diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
-        values, covariance = together.estimate()
+        values, covariance = together.estimate
         moves = dict(zip(together.names, values.tolist(), strict=True))
         whole, diagnoses = _moved(whole, moves, windows, sized=sized)
         progress(number + 1, _ROUNDS)

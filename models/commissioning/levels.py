@@ -30,17 +30,17 @@ from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import Identified, compare, has_angle, identify
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.lag_moments import LONGEST_LAG_STEP_S, passband_hz
-from models.diagnosis.baseline.learned import (
-    Baseline,
-    disagreements,
-    learn_baseline,
+from models.diagnosis.baseline.learned import disagreements, learn_baseline, planes_coupled, undetermined, unsuitable
+from models.diagnosis.baseline.rows import (
+    COUPLED_ROWS,
+    ROWS,
+    Row,
+    evaluable_rows,
+    formation_of,
     learned_rows,
-    planes_coupled,
-    undetermined,
-    unsuitable,
+    not_measured,
 )
-from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, evaluable_rows, formation_of, not_measured
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
 from models.diagnosis.verdict.sequential import SequentialSettings
@@ -234,11 +234,11 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     sources = check_sources({name: [each.window for each in pieces if each.recording == name] for name in names})
     band = _differentiated(baselines[0], machine)
     checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
-    records = []
-    for group, baseline in zip(groups, baselines, strict=True):
-        conditions = OperatingRange.of([piece.window for piece in group])
-        records.append(ConditionBaseline(conditions=conditions, baseline=BaselineRecord.of(baseline)))
-    return Learned(checks, tuple(read), tuple(compared), baselines=tuple(records), notes=(band, _LINEAR))
+    records = tuple(
+        ConditionBaseline(conditions=OperatingRange.of([piece.window for piece in group]), baseline=baseline)
+        for group, baseline in zip(groups, baselines, strict=True)
+    )
+    return Learned(checks, tuple(read), tuple(compared), baselines=records, notes=(band, _LINEAR))
 
 
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
@@ -262,7 +262,7 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     # If a single recording does not determine one of two planes, the other one is not trusted either.
     if all(lost) or (any(lost) and len(set(conditions)) < 2):
         raise EstimationError("; ".join(dict.fromkeys(reason for reason in reasons if reason)))
-    return replace(baseline, relations=relations, reasons=reasons)
+    return baseline.model_copy(update={"relations": relations, "reasons": reasons})
 
 
 def _differentiated(baseline: Baseline, machine: MachineFile) -> str:

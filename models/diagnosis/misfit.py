@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, FiniteFloat
 from scipy.special import chdtri, log_ndtr, ndtri
 
 from models.physics.rotor import impossible
@@ -55,10 +55,9 @@ class AlternativeTest:
     def told(self) -> str:
         """The cause and its size in words; empty if it is too small to matter, or impossible."""
         change, quantity = self.change, self.quantity
+        least, most, size = _LEAST_SUSPECT, _MOST_STATED_CHANGE, f"{change:+.1%}"
         if quantity == DELAY:
             least, most, size = _LEAST_DELAY_S, _LONGEST_DELAY_S, f"{1e6 * change:+.0f} µs"
-        else:
-            least, most, size = _LEAST_SUSPECT, _MOST_STATED_CHANGE, f"{change:+.1%}"
         # An unequal shaft that gains in y loses as much in z.
         if abs(change) < least or impossible(-abs(change) if self.name == UNEQUAL else change, quantity):
             return ""
@@ -77,8 +76,8 @@ class Goodness:
     @property
     def misfit_z(self) -> float:
         """The most significant test, Šidák-corrected: standard normal (one-sided) if the model holds."""
-        worst = max([-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives)])
-        tests = self.tests
+        two_sided = [-float(np.log(2) + log_ndtr(-abs(one.z))) for one in self.alternatives]
+        worst, tests = max([-log_ndtr(-self.excess_z), *two_sided]), self.tests
         log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
         return -float(ndtri(np.exp(max(log_p, -700.0))))
 
@@ -100,21 +99,16 @@ class Goodness:
         return "" if accounted < (_ACCOUNTS if unexplained else _ACCOUNTS_LITTLE) * self.excess else self.suspect
 
 
-def _two_sided(z: float) -> float:
-    return float(np.log(2) + log_ndtr(-abs(z)))
-
-
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Error = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Error = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class HealthyMisfit(BaseModel, extra="forbid", frozen=True):
     """How far healthy windows lie from the theory, for windows of the monitor's length."""
 
-    mean: _Finite = Field(description="mean of the windows' misfit, standard deviations")
-    scores: dict[str, _Finite] = Field(description="mean score of each thing that was tried, standard errors")
+    mean: FiniteFloat = Field(description="mean of the windows' misfit, standard deviations")
+    scores: dict[str, FiniteFloat] = Field(description="mean score of each thing that was tried, standard errors")
     error: _Error = Field(description="standard error of the mean scores")
-    excess: _Finite = Field(description="mean total excess, standard deviations")
+    excess: FiniteFloat = Field(description="mean total excess, standard deviations")
     excess_error: _Error = Field(description="its standard error")
     spreads: dict[str, _Error] = Field(
         default={},

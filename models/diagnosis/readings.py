@@ -261,6 +261,12 @@ def no_reading(name: str, by: str, reason: str) -> Parameter:
     return Parameter(name=name, text=PARAMETER_TEXT[name], by=by, reason=reason)
 
 
+def not_determined(error: float, most: float) -> str:
+    """Reason why there is no reading with this standard error: it is above `most`, or not a number."""
+    text, limit = beyond(100 * error, 100 * most)
+    return f"not determined in this window (standard error {text} %, limit for a reading {limit} %)"
+
+
 def possible_reading(
     name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
 ) -> Parameter:

@@ -22,10 +22,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from scipy.special import fdtrc, fdtri, ndtri
 
 from models.diagnosis.window.statistics import WindowStatistics
@@ -42,16 +41,15 @@ _DIRECTIONS = 3
 _SPEED_TOLERANCE = 0.03
 _LAG_TOLERANCE_S = 1e-9
 _LEAST_P = 1e-300
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ShapeSpread(BaseModel, extra="forbid", frozen=True, strict=True):
     """Healthy shape of one channel and its spread."""
 
     channel: str = Field(min_length=1)
-    mean: tuple[_Finite, ...] = Field(min_length=2)  # ρ at the lags
+    mean: tuple[FiniteFloat, ...] = Field(min_length=2)  # ρ at the lags
     # Each maps a deviation of ρ to a coordinate that has unit variance from sampling alone.
-    directions: tuple[tuple[_Finite, ...], ...] = Field(min_length=1)
+    directions: tuple[tuple[FiniteFloat, ...], ...] = Field(min_length=1)
     variance: float = Field(gt=0, allow_inf_nan=False)  # tr S of the healthy windows in these coordinates
     freedom: float = Field(ge=1, allow_inf_nan=False)  # f, between 1 and the number of directions
 
@@ -68,8 +66,8 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
 
     windows: int = Field(ge=FEWEST_WINDOWS)  # healthy windows it was learned from
     window_s: float = Field(gt=0, allow_inf_nan=False)  # length of the shortest of them
-    lags_s: tuple[_Finite, ...] = Field(min_length=2)
-    speed_rad_s: tuple[_Finite, _Finite] | None  # slowest and fastest of them; None without a phase reference
+    lags_s: tuple[FiniteFloat, ...] = Field(min_length=2)
+    speed_rad_s: tuple[FiniteFloat, FiniteFloat] | None  # slowest and fastest of them; None without a phase reference
     channels: tuple[ShapeSpread, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -102,11 +100,9 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         """
         if not 0 < rate < 1:
             raise ValueError(f"rate is {rate}, expected between 0 and 1")
-        window = window.as_mounted
-        own_rate = self._own_rate(rate)
-        limit = -float(ndtri(own_rate))
+        window, own_rate = window.as_mounted, self._own_rate(rate)
         common = self._not_comparable(window)
-        return tuple(self._judged(one, window, common, own_rate, limit) for one in self.channels)
+        return tuple(self._judged(one, window, common, own_rate) for one in self.channels)
 
     def _not_comparable(self, window: WindowStatistics) -> str:
         """Why no channel of the window can be compared; empty if they can."""
@@ -114,21 +110,17 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         if window.lags_s.shape != lags.shape or np.any(np.abs(window.lags_s - lags) > _LAG_TOLERANCE_S):
             return f"its lags differ from the {len(lags)} lags up to {lags[-1]:g} s that were learned"
         if self.speed_rad_s is not None:
-            slowest, fastest = self.speed_rad_s
-            now = window.speed_rad_s
+            (slowest, fastest), now, rpm = self.speed_rad_s, window.speed_rad_s, 30 / math.pi
             if not math.isfinite(now):
                 return "its speed is not known"
             if not slowest * (1 - _SPEED_TOLERANCE) <= now <= fastest * (1 + _SPEED_TOLERANCE):
-                rpm = 30 / math.pi
-                seen = f"{slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
-                return f"speed {now * rpm:.0f} rpm, commissioned at {seen}"
+                return f"speed {now * rpm:.0f} rpm, commissioned at {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
         return ""
 
-    def _judged(self, one: ShapeSpread, window: WindowStatistics, common: str, rate: float, limit: float) -> Shape:
-        reason = common
-        if not reason and one.channel not in window.states:
-            reason = "not measured"
+    def _judged(self, one: ShapeSpread, window: WindowStatistics, common: str, rate: float) -> Shape:
+        reason = common or ("" if one.channel in window.states else "not measured")
         rho = None if reason else _shape(window, one.channel)
+        limit = -float(ndtri(rate))
         stated = partial(Shape, state=one.channel, limit=limit)
         if rho is None:
             reason = reason or "it does not move, or its correlation is not finite"
@@ -141,16 +133,12 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         z = -float(ndtri(min(max(p, _LEAST_P), 1 - 1e-16)))
         figures = f"{z:.1f} standard deviations, limit {limit:.1f}"
         if p < rate:
-            text = (
-                f"{one.channel}: its correlation function has changed shape ({figures}); this comparison cannot "
-                "tell whether the machine or its excitation has"
-            )
-            return stated(verdict="changed", z=z, text=text)
+            seen = f"its correlation function has changed shape ({figures})"
+            unsure = "this comparison cannot tell whether the machine or its excitation has"
+            return stated(verdict="changed", z=z, text=f"{one.channel}: {seen}; {unsure}")
         if not _power(one, self.windows, np.array(self.lags_s), rate).growth <= SEEN_GROWTH:
-            text = (
-                f"{one.channel}: not evaluable, with {self.windows} healthy windows not even noise that makes it "
-                f"{SEEN_GROWTH:g} times as loud would change its shape beyond chance"
-            )
+            unseen = f"not even noise that makes it {SEEN_GROWTH:g} times as loud would change its shape beyond chance"
+            text = f"{one.channel}: not evaluable, with {self.windows} healthy windows {unseen}"
             return stated(verdict="not evaluable", z=z, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
         return stated(verdict="not changed", z=z, text=text)

@@ -78,7 +78,7 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape = commissioned.shape
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
-        self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
+        self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
         self.takes_short = self._baselines != ()
 
@@ -132,7 +132,7 @@ class BaselineEvaluator(WindowEvaluator):
         whole, misfit_z = test.settings.window_hops, deciding.misfit_z or 0.0
         if misfit_z <= _MOST_MISFIT_Z and test.wanted() == test.settings.short_hops:
             return deciding, found
-        limit, start_ns = test.thresholds(whole).outside, sliding.hops[0].start_ns
+        limit, start_ns = test.settings.thresholds(whole).outside, sliding.hops[0].start_ns
         outside = misfit_z > limit
         before = [one for one in test.state.sums.get(1, ()) if one.end_ns > start_ns and not one.unexplained]
         if outside and not any((one.misfit_z or 0.0) <= limit for one in before):

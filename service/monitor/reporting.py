@@ -137,7 +137,7 @@ class WindowReporter:
             misfit_z=evaluation.deciding.misfit_z,
             suspect=suspect if verdict.outside_model or foreign.hides else "",
             verdict=verdict,
-            detectable=() if unexplained else detectable_changes(look, test.thresholds(whole), length_s),
+            detectable=() if unexplained else detectable_changes(look, test.settings.thresholds(whole), length_s),
             reason=reason,
             shapes=evaluation.shapes,
         )

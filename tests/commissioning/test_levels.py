@@ -21,6 +21,7 @@ from models.commissioning.commissioned import (
     knowledge_of,
     load_commissioned,
 )
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.misfit import AlternativeTest, Goodness, HealthyMisfit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.reference import Naming
@@ -241,7 +242,7 @@ def test_a_commissioned_bundle_round_trips_through_its_file(level: str, tmp_path
     assert (installed.known is None) == (level == "none")
     (window,) = windows_of(healthy(machine, 66.0, 43))
     for fresh, restored in zip(made.commissioned.baselines, again.baselines, strict=True):
-        first, second = (one.baseline.diagnostician().diagnose(window) for one in (fresh, restored))
+        first, second = (BaselineDiagnostician(one.baseline).diagnose(window) for one in (fresh, restored))
         assert first.parameters == second.parameters
 
 

@@ -61,7 +61,7 @@ def test_lines_are_removed_from_correlations_at_all_lags_exactly_once() -> None:
 def test_relations_learned_with_lines_agree_with_those_learned_without() -> None:
     assert {round(line_hz) for line_hz, _ in made(lines=True).lines} == {44, 50, 100, 150}
     assert made(lines=False).lines == ()
-    own, seen = (made(lines=lines).baselines[0].baseline.baseline().relations for lines in (False, True))
+    own, seen = (made(lines=lines).baselines[0].baseline.relations for lines in (False, True))
     for one, other in zip(map(sure, own), map(sure, seen), strict=True):
         errors = np.sqrt(np.diag(one.covariance))
         assert np.all(np.abs(other.coefficients - one.coefficients) < 0.2 * errors)  # 1.8 with the lines

@@ -5,7 +5,6 @@ disc scales all of the row's own parameters by one factor. If one of several sen
 with a single sensor, or several on one transducer, the common factor is the only evidence.
 """
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
 
-from models.diagnosis.baseline.force import alike, force_spectrum
-from models.diagnosis.baseline.growth import motion_power
+from models.diagnosis.baseline.conditions import alike, force_spectrum, motion_power
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
-from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
+from models.diagnosis.baseline.learned import positive, unsuitable
 from models.diagnosis.baseline.relation import LOST, Relation, RowChange, one_source, read_row
-from models.diagnosis.baseline.rows import Row, parameters_of
+from models.diagnosis.baseline.rows import Row, consecutive, learned_rows, parameters_of
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
     ForceRow,
@@ -36,7 +35,6 @@ from models.signals.block import FloatArray
 _SINGLE = 2.326  # standard errors beyond which no single parameter explains a window (one per cent, one-sided)
 _COMMON = 2.576  # standard errors within which a common factor explains it (one per cent, two-sided)
 _MOST_LOSS = -0.95
-_NO_SPEED = "no phase reference, and no speed found in the vibration"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +120,8 @@ class BaselineDiagnostician:
         rows = baseline.rows if rows is None else rows
         self._baseline = baseline
         self._rows = learned_rows(rows)
-        self._slices = coefficient_slices(self._rows)
-        ends = np.cumsum([0, *(len(row.own) for row in self._rows)]).tolist()
-        self._own = tuple(slice(a, b) for a, b in itertools.pairwise(ends))
+        self._slices = consecutive(row.n_coefficients for row in self._rows)
+        self._own = consecutive(len(row.own) for row in self._rows)
         self._forces = {
             row.name: ForceRow(row, at, own)
             for row, at, own in zip(self._rows, self._slices, self._own, strict=True)
@@ -134,6 +131,8 @@ class BaselineDiagnostician:
         self._parameters = parameters_of(rows)
         self._own_of = {own.parameter: own for row in rows for own in row.own}
         self._conditions = max(1, len({one.condition for one in baseline.consistency}))
+        # Records from before growth was learned do not say whether the relations were tested in one condition only.
+        self._one_condition = self._conditions == 1 and bool(baseline.growth)
         self._coefficients = np.zeros(self._slices[-1].stop)
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
@@ -211,11 +210,6 @@ class BaselineDiagnostician:
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
-    @property
-    def _one_condition(self) -> bool:
-        """Whether the relations were tested in one condition only; False for records from before growth was learned."""
-        return self._conditions == 1 and bool(self._baseline.growth)
-
     def _as_commissioned(self, changes: Sequence[RowChange | None]) -> bool:
         """Whether the force, computed with the changes of the window, is the commissioned one."""
         seen = [change for change in changes if change is not None]
@@ -260,17 +254,14 @@ class BaselineDiagnostician:
                 noise[self._own[i], self._own[j]] = own
                 noise[self._own[j], self._own[i]] = own.T
         common = sensitivity @ self._baseline.covariance @ sensitivity.T
-        for i, change in enumerate(changes):
-            relation = self._baseline.relations[i]
-            if change is None or relation is None:
+        for i, relation in enumerate(self._baseline.relations):
+            if relation is None or changes[i] is None:
                 continue
-            for number, parameter in enumerate(self._rows[i].own):
-                learned = [term - 1 for term in parameter.terms if term]
-                if len(learned) == 1 and 0 not in parameter.terms:
+            for place, parameter in enumerate(self._rows[i].own, start=self._own[i].start):
+                if len(parameter.terms) == 1 and parameter.terms != (0,):
                     # a relative change of damping is in units of a damping that is itself only estimated
-                    at = learned[0]
+                    at = parameter.terms[0] - 1
                     relative = relation.covariance[at, at] / relation.coefficients[at] ** 2
-                    place = self._own[i].start + number
                     common[place, place] += max(0.0, (1 + values[place]) ** 2 - 1) * relative
         return _Bearing(values, noise, sensitivity, common)
 
@@ -330,14 +321,13 @@ class BaselineDiagnostician:
         now = rotation_of(window, coordinates)
         if not self._baseline.rotations:
             raise EstimationError("the baseline has no phase reference and no speed found in the vibration")
-        slowest, fastest = (speed * _RPM for speed in window.speed_range)
-        if now is None and fastest > slowest * (1 + SPEED_TOLERANCE):
-            raise EstimationError(
-                f"the speed varies from {slowest:.0f} to {fastest:.0f} rpm within the window, "
-                f"compared up to {SPEED_TOLERANCE:.0%}"
-            )
         if now is None:
-            raise EstimationError(_NO_SPEED)
+            slowest, fastest = (speed * _RPM for speed in window.speed_range)
+            reason = "no phase reference, and no speed found in the vibration"
+            if fastest > slowest * (1 + SPEED_TOLERANCE):
+                varied = f"the speed varies from {slowest:.0f} to {fastest:.0f} rpm within the window"
+                reason = f"{varied}, compared up to {SPEED_TOLERANCE:.0%}"
+            raise EstimationError(reason)
         healthy = min(self._baseline.rotations, key=lambda one: abs(now.speed_rad_s / one.speed_rad_s - 1))
         if abs(now.speed_rad_s / healthy.speed_rad_s - 1) > SPEED_TOLERANCE:
             learned = ", ".join(f"{one.speed_rad_s * _RPM:.0f}" for one in self._baseline.rotations)
@@ -384,8 +374,6 @@ def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: st
     lacking = [name for name in relation.states if name not in window.states]
     if lacking:
         return None, f"not measured: {', '.join(lacking)}, which the baseline was learned with"
-    if row.needs_speed and not np.isfinite(window.speed_rad_s):
-        return None, _NO_SPEED
     references = tuple(name for name in relation.references if name in window.states)
     try:
         return read_row(row, relation, row_window(row, window, relation.states, references)), ""

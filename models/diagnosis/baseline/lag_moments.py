@@ -50,18 +50,11 @@ class Shape:
 
 
 def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
-    """Shape of kernels that can be differentiated a given number of times.
+    """Shape of kernels that can be differentiated `deepest` times (`Formation.deepest`), at most 4.
 
     For one derivative a narrow kernel is enough. Each further one amplifies the sensors' noise by another power of the
-    frequency. Kernels must then be wide enough to pass hardly anything beyond the band of the spectra, as the scatter
-    of the moments is computed from the spectra.
-
-    Parameters
-    ----------
-    deepest : int
-        Largest number of derivatives of a kernel (`Formation.deepest`), at most 4.
-    band_to_hz : float
-        Highest frequency of the window's spectra.
+    frequency. Kernels must then be wide enough to pass hardly anything beyond the band of the spectra, which ends at
+    `band_to_hz`, as the scatter of the moments is computed from the spectra.
     """
     spacing_s = _SPACING_S * time_scale
     if deepest <= 1:
@@ -154,14 +147,14 @@ class LagMoments:
         matrix[self.of.pairs[1], self.of.pairs[0]] = found
         return matrix
 
-    def scatter(self, combination: FloatArray, weight: npt.NDArray[np.floating], rank: int) -> float:
-        """Variance of the combination from hop to hop over that expected from `weight`, the inverse covariance."""
+    def widening(self, combination: FloatArray, weight: npt.NDArray[np.floating], rank: int) -> float:
+        """Hop-to-hop variance of the combination over that of `weight`, an inverse covariance; at least 1."""
         hops = self.hop_values @ combination
         hops = hops - hops.mean(axis=0)
         count = hops.shape[0]
         if count < 3:
             return 1.0
-        return float(np.sum((hops @ weight) * hops) / (count * (count - 1) * rank))
+        return max(1.0, float(np.sum((hops @ weight) * hops) / (count * (count - 1) * rank)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,31 +170,25 @@ class RowWindow:
     # their references and by the distance of their kernels
     blocks: FloatArray
     pairs: npt.NDArray[np.intp]  # (2, n_pairs), the pairs of terms
-    factors: FloatArray  # (n_terms,), the speed for terms whose coefficient is proportional to it, else one
-
-    @property
-    def shape(self) -> Shape:
-        """Shape of the kernels."""
-        window = self.window
-        return shape_for(self.formation.deepest, float(window.frequencies_hz[-1]), window.time_scale)
+    shape: Shape  # of the kernels
 
     def beyond(self, lag_from_s: float) -> LagMoments:
         """Moments beyond a shortest lag."""
         window, formation = self.window, self.formation
-        column = {name: position for position, name in enumerate(window.states)}
-        references = [column[name] for name in self.references]
+        references = [window.states.index(name) for name in self.references]
         over = kernels(window.lags_s.tobytes(), lag_from_s, self.shape, formation.deepest)
 
         def moments(correlation: FloatArray) -> FloatArray:
             seen: dict[tuple[str, int], FloatArray] = {}
             columns = []
-            for term, factor in zip(formation.terms, self.factors, strict=True):
+            for term in formation.terms:
                 total: FloatArray | float = 0.0
                 for source in term:
                     key = source.state, source.derivatives
                     if key not in seen:
-                        seen[key] = over.values[source.derivatives] @ correlation[..., references, column[source.state]]
-                    total = total + source.factor * factor * seen[key]
+                        column = window.states.index(source.state)
+                        seen[key] = over.values[source.derivatives] @ correlation[..., references, column]
+                    total = total + source.factor * seen[key]
                 columns.append(np.swapaxes(np.asarray(total), -2, -1))
             stacked = np.stack(columns, axis=-1)
             return np.asarray(stacked.reshape(*stacked.shape[:-3], -1, len(columns)), dtype=np.float64)
@@ -209,30 +196,25 @@ class RowWindow:
         index = _block_index(len(references), over.centres_s.size, self.blocks.shape[3])
         return LagMoments(self, over, moments(window.correlation), moments(window.hop_correlation), index)
 
-    def residual_spectrum(self, combination: FloatArray) -> FloatArray:
-        """Power spectral density of a combination of the terms, shape (n_bins,)."""
-        density = np.einsum("i,fij,j->f", combination, self.spectra, combination, optimize=True).real
-        return np.asarray(np.clip(density, 0.0, None), dtype=np.float64)
-
 
 def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
     """Prepare a row in a window, whose correlations must reach to lags of 0.1 s times the time scale or more."""
     formation = formation_of([term.motions for term in row.terms], states)
-    index = {name: position for position, name in enumerate(window.states)}
     f = window.frequencies_hz
     n_terms = len(row.terms)
-    factors = np.array([window.speed_rad_s if term.times_speed else 1.0 for term in row.terms])
     terms = np.zeros((f.size, len(window.states), n_terms), dtype=np.complex128)
     for number, sources in enumerate(formation.terms):
         for source in sources:
             rate = (2j * np.pi * f) ** source.derivatives
-            terms[:, index[source.state], number] += source.factor * factors[number] * rate
+            terms[:, window.states.index(source.state), number] += source.factor * rate
     spectra = terms.transpose(0, 2, 1) @ window.spectrum @ terms.conj()
-    columns = [index[name] for name in references]
+    columns = [window.states.index(name) for name in references]
     pairs = np.array(np.triu_indices(n_terms))
     own = spectra[:, pairs[0], pairs[1]].real
     shape = shape_for(formation.deepest, float(f[-1]), window.time_scale)
-    between = _reference_spectra(window, columns, shape)
+    # The references' cross-spectra times the kernels' squared gain and each bin's weight in Bartlett's formula.
+    weight = _bin_weights(window) * gain(f, shape) ** 2
+    between = window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None]
     shortest_s = SHORTEST_LAG_FROM_S * window.time_scale
     centres_s = kernels(window.lags_s.tobytes(), shortest_s, shape, formation.deepest).centres_s
     cosine, sine = _waves(f.tobytes(), float(centres_s[1] - centres_s[0]), centres_s.size)
@@ -242,13 +224,7 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     odd = own.T @ (flat.imag[:, :, None] * sine[:, None, :]).reshape(f.size, -1)
     earlier, later = (each.reshape(pairs.shape[1], len(columns), len(columns), -1) for each in (even + odd, even - odd))
     blocks = np.concatenate([earlier[..., :0:-1], later], axis=-1)
-    return RowWindow(window, formation, references, terms, spectra, blocks, pairs, factors)
-
-
-def _reference_spectra(window: WindowStatistics, columns: list[int], shape: Shape) -> ComplexArray:
-    """Cross-spectra of the references times the kernels' squared gain and each bin's weight in Bartlett's formula."""
-    weight = _bin_weights(window) * gain(window.frequencies_hz, shape) ** 2
-    return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
+    return RowWindow(window, formation, references, terms, spectra, blocks, pairs, shape)
 
 
 def _bin_weights(window: WindowStatistics) -> FloatArray:
@@ -281,11 +257,10 @@ def _block_index(n_references: int, n_kernels: int, n_distances: int) -> npt.NDA
 def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: FloatArray) -> FloatArray:
     """Covariance between the moments of two combinations in one window, shape (n_moments of a, n_moments of b)."""
     window = a.of.window
-    index = {name: position for position, name in enumerate(window.states)}
     f = window.frequencies_hz
     left, right = a.of.terms @ of_a, b.of.terms @ of_b
     density = np.einsum("fi,fij,fj->f", left, window.spectrum, right.conj(), optimize=True)
-    rows, columns = ([index[name] for name in one.of.references] for one in (a, b))
+    rows, columns = ([window.states.index(name) for name in one.of.references] for one in (a, b))
     weight = _bin_weights(window) * gain(f, a.of.shape) * gain(f, b.of.shape) * density
     between = window.spectrum[:, rows][:, :, columns].conj() * weight[:, None, None]
     ours, theirs = a.kernels.centres_s, b.kernels.centres_s

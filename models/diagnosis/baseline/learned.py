@@ -1,15 +1,11 @@
 """The baseline of a machine without parameters: learning it from healthy windows, and how well they agree."""
 
-import itertools
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
 
-from models.diagnosis.baseline.force import force_spectrum
-from models.diagnosis.baseline.growth import Growth, growth_of
+from models.diagnosis.baseline.conditions import force_spectrum, growth_of
 from models.diagnosis.baseline.lag_moments import (
     LONGEST_LAG_STEP_S,
     LagMoments,
@@ -17,10 +13,19 @@ from models.diagnosis.baseline.lag_moments import (
     row_window,
     shared_covariance,
 )
-from models.diagnosis.baseline.numbers import NotNegative, Number, Positive
 from models.diagnosis.baseline.relation import Contribution, Relation, beyond_memory, change_of, learn_row
-from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, lowest, not_measured, state_of
-from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
+from models.diagnosis.baseline.rows import (
+    COUPLED_ROWS,
+    ROWS,
+    Row,
+    consecutive,
+    learned_rows,
+    lowest,
+    not_measured,
+    state_of,
+)
+from models.diagnosis.baseline.stored import NO_FORCE, Baseline, HeldOutReading, LeftOut
+from models.diagnosis.baseline.unbalance import rotation_of, rotations_by_speed
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT
@@ -29,33 +34,6 @@ from models.signals.block import FloatArray
 _FOLDS = 6
 _FEWEST_OTHERS = 2
 _BEYOND = 2.0  # standard deviations beyond which a mean is taken for more than scatter
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOutReading:
-    """One parameter of one healthy window, read against the relation learned in the other conditions."""
-
-    parameter: str
-    # Relative change and its standard error, including the relation's error.
-    change: Number
-    standard_error: Positive
-
-    @property
-    def z(self) -> float:
-        """Change in standard errors: standard normal if one relation holds for all."""
-        return self.change / self.standard_error
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """One healthy window of one row, read against the relation learned in the other conditions."""
-
-    row: str  # name of the row
-    window: Annotated[int, Field(ge=0)]  # number of the window, from 0
-    condition: str  # condition of the window
-    agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
-    misfit: NotNegative  # χ² of the residual per degree of freedom
-    degrees_of_freedom: Annotated[int, Field(ge=1)]
 
 
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
@@ -114,54 +92,6 @@ _SHORTEST_LAG_RANGE_S = 0.1
 # errors.
 _COUPLED, _SHOWN = 0.03, 4.0
 _FEWEST_HOPS = 2
-NO_FORCE: FloatArray = np.zeros((0, 0, 0))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Baseline:
-    """Everything learned on a healthy machine."""
-
-    relations: tuple[Relation | None, ...]  # one for each learned row of the table; None if it has no relation
-    reasons: tuple[str, ...]  # why a row has no relation; empty if it has one
-    # (n, n): of the coefficients of all rows one after the other; zero for rows without a relation
-    covariance: FloatArray
-    # Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
-    rotations: tuple[SynchronousVectors, ...]
-    duration_s: float  # length of the healthy data
-    # Every healthy window of every row, read against the relation learned in the other conditions.
-    consistency: tuple[LeftOut, ...] = ()
-    # (n_bands, n_rows, n_rows): force that the relations were learned under (`force_spectrum`); empty with several
-    # conditions, or if a row has no relation
-    force: FloatArray = field(default_factory=NO_FORCE.copy)
-    # Growth of the stiffness of each learned row with the motion; None if unknown, empty in older records.
-    growth: tuple[Growth | None, ...] = ()
-
-    @property
-    def without_force(self) -> "Baseline":
-        """The same without the force: readings get the errors of other conditions, whatever moves the machine."""
-        return replace(self, force=NO_FORCE)
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Measured states used by the relations, which later windows must have."""
-        return tuple(sorted({name for one in self.relations if one is not None for name in one.states}))
-
-    @property
-    def rows(self) -> tuple[Row, ...]:
-        """The shipped table of rows that the baseline was learned with."""
-        n_coupled = coefficient_slices(learned_rows(COUPLED_ROWS))[-1].stop
-        return COUPLED_ROWS if len(self.covariance) == n_coupled else ROWS
-
-
-def learned_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Rows that are learned on the stochastic part of the signals."""
-    return tuple(row for row in rows if not row.synchronous)
-
-
-def coefficient_slices(rows: Sequence[Row]) -> tuple[slice, ...]:
-    """Slice of each row's coefficients in the vector of all coefficients."""
-    ends = np.cumsum([0, *(row.n_coefficients for row in rows)]).tolist()
-    return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
 
 def learn_baseline(
@@ -210,7 +140,7 @@ def learn_baseline(
         raise EstimationError("; ".join(dict.fromkeys(reasons)))
     # Keep the synchronous vectors of all rows from which the unbalance can be read.
     there = {relation.row for relation in relations if relation is not None}
-    used = [row for row in rows if row.synchronous and row.rests_on in there]
+    used = [row for row in rows if row.rests_on in there]
     coordinates = tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
     rotations = [rotation_of(window, coordinates) for window in windows]
     return Baseline(
@@ -221,27 +151,27 @@ def learn_baseline(
         duration_s=sum(window.duration_s for window in windows),
         consistency=tuple(consistency),
         growth=tuple(growth),
-        **_learned_under(relations, parts, groups),
+        force=_learned_under(relations, parts, groups),
     )
 
 
 def _learned_under(
     relations: Sequence[Relation | None], parts: Sequence[list[Contribution]], groups: Sequence[Hashable]
-) -> dict[str, FloatArray]:
+) -> FloatArray:
     known = [relation.combination for relation in relations if relation is not None]
     if len(known) < len(relations) or len(set(groups)) > 1:
-        return {}
+        return NO_FORCE
     by_window = zip(*parts, strict=True)
     found = [force_spectrum([one.moments.of for one in rows], known) for rows in by_window]
-    return {"force": np.mean(found, axis=0)} if len({one.shape for one in found}) == 1 else {}
+    if len({one.shape for one in found}) > 1:
+        return NO_FORCE
+    return np.asarray(np.mean(found, axis=0), dtype=np.float64)
 
 
 def _learn(
     row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...], *, widened: bool = True
 ) -> tuple[Relation | None, list[Contribution], str]:
     reason = not_measured(row.motions, states)
-    if not reason and row.needs_speed and not all(np.isfinite(window.speed_rad_s) for window in windows):
-        reason = "no phase reference"
     if reason:
         return None, [], reason
     try:
@@ -264,14 +194,12 @@ def planes_coupled(windows: Sequence[WindowStatistics]) -> bool:
     if not windows or any(unsuitable(window) for window in windows):
         return False
     states = tuple(name for name in windows[0].states if all(name in window.states for window in windows))
-    for row in learned_rows(COUPLED_ROWS):
-        relation, _, _ = _learn(row, windows, states, widened=False)
-        if relation is None:
-            continue
-        across, error = relation.coefficients[-2], np.sqrt(relation.covariance[-2, -2])
-        if abs(across) > max(_COUPLED, _SHOWN * error):
-            return True
-    return False
+    relations = (_learn(row, windows, states, widened=False)[0] for row in learned_rows(COUPLED_ROWS))
+    return any(
+        abs(one.coefficients[-2]) > max(_COUPLED, _SHOWN * np.sqrt(one.covariance[-2, -2]))
+        for one in relations
+        if one is not None
+    )
 
 
 def references_of(states: tuple[str, ...]) -> tuple[str, ...]:
@@ -283,7 +211,7 @@ def references_of(states: tuple[str, ...]) -> tuple[str, ...]:
 def _covariance(
     rows: tuple[Row, ...], relations: Sequence[Relation | None], parts: Sequence[list[Contribution]]
 ) -> FloatArray:
-    slices = coefficient_slices(rows)
+    slices = consecutive(row.n_coefficients for row in rows)
     total = np.zeros((slices[-1].stop, slices[-1].stop))
     for i, first in enumerate(relations):
         if first is None:

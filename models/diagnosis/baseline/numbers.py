@@ -4,14 +4,14 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetPydanticSchema, PlainSerializer
+from pydantic import AfterValidator, Field, FiniteFloat, GetPydanticSchema
+from pydantic_core import core_schema as cs
 
 from models.signals.block import FloatArray
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Rows = tuple[tuple[Number, ...], ...]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+_Rows = tuple[tuple[FiniteFloat, ...], ...]
 
 
 def _array(rows: tuple[Any, ...]) -> FloatArray:
@@ -34,11 +34,12 @@ def _cube(bands: tuple[_Rows, ...]) -> FloatArray:
 
 
 def _stored(kind: object, made: Callable[[Any], FloatArray] = _array) -> GetPydanticSchema:
-    """Store an array as nested numbers."""
-    as_numbers = Annotated[kind, AfterValidator(made), PlainSerializer(np.ndarray.tolist)]  # type: ignore[valid-type]
-    return GetPydanticSchema(lambda _, handler: handler(as_numbers))
+    """An array in the program, nested numbers in JSON."""
+    numbers = Annotated[kind, AfterValidator(made)]  # type: ignore[valid-type]
+    array, saved = cs.is_instance_schema(np.ndarray), cs.plain_serializer_function_ser_schema(np.ndarray.tolist)
+    return GetPydanticSchema(lambda _, handler: cs.json_or_python_schema(handler(numbers), array, serialization=saved))
 
 
-Vector = Annotated[FloatArray, _stored(tuple[Number, ...])]
+Vector = Annotated[FloatArray, _stored(tuple[FiniteFloat, ...])]
 Covariance = Annotated[FloatArray, _stored(Annotated[_Rows, AfterValidator(_square)])]
 Spectra = Annotated[FloatArray, _stored(tuple[Annotated[_Rows, AfterValidator(_square)], ...], _cube)]

@@ -71,7 +71,7 @@ def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatA
     for part in parts:
         W, kept = inverse(part.covariance(combination))
         left = part.values @ combination
-        total += float(left @ W @ left) / max(1.0, part.scatter(combination, W, kept)) - kept
+        total += float(left @ W @ left) / part.widening(combination, W, kept) - kept
     return total
 
 
@@ -94,7 +94,8 @@ def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
     f = row.window.frequencies_hz * scale  # scaled to a machine that suits the usual window
     used = f >= _LOWEST_RAISED_HZ if raised else np.ones(f.size, dtype=bool)
     f = f[used]
-    density = row.residual_spectrum(combination)[used] / f ** (2 * raised)
+    residual = np.einsum("i,fij,j->f", combination, row.spectra, combination, optimize=True).real
+    density = np.clip(residual, 0.0, None)[used] / f ** (2 * raised)
     logarithm, inverse_model = _models(f.tobytes())
     cost = logarithm + np.log(inverse_model @ density / f.size)
     cutoff_hz = _CUTOFFS_HZ[int(np.argmin(cost)) // _NOISES.size]
@@ -303,14 +304,8 @@ def learn_row(
 ) -> tuple[Relation, list[Contribution]]:
     """Learn the relation of a row from moments of healthy windows that do not overlap, each in one condition.
 
-    Parameters
-    ----------
-    fits : tuple of Fit, optional
-        Result of `fit_row` for these moments, if already known.
-    lag_from_s : float
-        Shortest lag at which later windows are to be read.
-    widened : bool
-        Whether the covariance is widened to agree with the criterion (`stretching`), which takes most of the time.
+    `fits` is the result of `fit_row` for these moments, if already known; later windows are to be read from
+    `lag_from_s` on. Widening the covariance to agree with the criterion (`stretching`) takes most of the time.
 
     Raises
     ------
@@ -330,7 +325,8 @@ def learn_row(
     spread = np.sqrt(np.diag(covariance))
     for own in row.own:
         for number in (term for term in own.terms if term):
-            known = abs(b[number - 1]) > 2 * spread[number - 1] and (b[number - 1] < 0 or not own.resists)
+            # Stiffness and damping have the sign of the first term: a fit with the other one has not determined them.
+            known = -b[number - 1] > 2 * spread[number - 1]
             if not (np.all(np.isfinite(b)) and known):
                 raise EstimationError(
                     f"{row.title}: the healthy recording does not determine {own.parameter}; record longer, or "
@@ -354,8 +350,8 @@ def learn_row(
     contributions = []
     for part in parts:
         W, kept = inverse(part.covariance(relation.combination))
-        widening = max(1.0, part.scatter(relation.combination, W, kept))
-        contributions.append(Contribution(part, stretch @ covariance @ part.values[:, 1:].T @ W / widening))
+        projection = stretch @ covariance @ part.values[:, 1:].T @ W / part.widening(relation.combination, W, kept)
+        contributions.append(Contribution(part, projection))
     return relation, contributions
 
 
@@ -366,7 +362,7 @@ def _fit(parts: Sequence[LagMoments], b: FloatArray, prior: FloatArray, iteratio
         Q, C, rank = np.zeros((n, n)), np.zeros((n, n)), 0
         for part in parts:
             W, kept = inverse(part.covariance(combination))
-            widening = max(1.0, part.scatter(combination, W, kept))
+            widening = part.widening(combination, W, kept)
             Q += part.values.T @ W @ part.values / widening
             C += part.noise(W) / widening
             rank += kept
@@ -444,8 +440,7 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
         own_covariance = moments.covariance(combination)
         kept = telling(own_covariance)
         used, grid = moments.only(kept), np.ix_(kept, kept)
-        scatter = used.scatter(combination, np.linalg.inv(own_covariance[grid]), kept.size)
-        widening = max(1.0, scatter) * relation.allowance
+        widening = used.widening(combination, np.linalg.inv(own_covariance[grid]), kept.size) * relation.allowance
         W = np.linalg.inv(own_covariance[grid] * widening + uncertain[grid])
         Q = Z[kept].T @ W @ Z[kept]
         C = signatures.T @ used.noise(W) @ signatures * widening

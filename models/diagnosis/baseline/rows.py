@@ -14,28 +14,22 @@ only a velocity or an acceleration is measured at a place, the whole row is diff
 holds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 from models.physics.rotor import PARAMETERS
 
 ORDERS = ("", "_dot", "_ddot")  # endings of the state variable's name by order of the derivative that is measured
 
-_PLACES = {
-    "y1": "bearing, horizontal",
-    "y2": "disc, horizontal",
-    "z1": "bearing, vertical",
-    "z2": "disc, vertical",
-    "psi": "tilt of the disc, horizontal",
-    "phi": "tilt of the disc, vertical",
-}
+_PLACES = {"y1": "bearing, horizontal", "y2": "disc, horizontal", "z1": "bearing, vertical", "z2": "disc, vertical"}
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
     """A derivative of a coordinate."""
 
-    coordinate: str  # ``y1``, ``y2``, ``z1``, ``z2``, ``psi`` or ``phi``
+    coordinate: str  # ``y1``, ``y2``, ``z1`` or ``z2``
     order: int  # of the derivative
     factor: float = 1.0  # its weight in a sum
 
@@ -78,20 +72,15 @@ def _measured(coordinate: str, states: Sequence[str]) -> list[int]:
 
 def lowest(coordinate: str, states: Sequence[str]) -> int | None:
     """Lowest derivative of a coordinate that is measured; None if none is."""
-    orders = _measured(coordinate, states)
-    return orders[0] if orders else None
+    return next(iter(_measured(coordinate, states)), None)
 
 
 def not_measured(motions: Sequence[Motion], states: Sequence[str]) -> str:
     """Sentence on the coordinates of these motions that are not measured; empty if all are."""
     coordinates = dict.fromkeys(motion.coordinate for motion in motions)
-    missing = [_described(coordinate) for coordinate in coordinates if not _measured(coordinate, states)]
-    return f"not measured: {'; '.join(missing)}" if missing else ""
-
-
-def _described(coordinate: str) -> str:
-    kinds = "angle, rate or acceleration" if coordinate in ("psi", "phi") else "displacement, velocity or acceleration"
-    return f"{_PLACES[coordinate]} ({kinds})"
+    places = [_PLACES[coordinate] for coordinate in coordinates if not _measured(coordinate, states)]
+    missing = "; ".join(f"{place} (displacement, velocity or acceleration)" for place in places)
+    return f"not measured: {missing}" if missing else ""
 
 
 def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Formation:
@@ -113,9 +102,6 @@ def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Fo
     return Formation(raised, tuple(formed))
 
 
-_NO_PHASE = "no phase reference, and no speed to look for in the vibration"
-
-
 @dataclass(frozen=True, slots=True)
 class Term:
     """One term of a row: motions that share a coefficient."""
@@ -126,7 +112,6 @@ class Term:
     in_units_of: int | None = None  # term whose coefficient is the unit of `spread` and `about`
     about: float = 0.0  # prior mean of the coefficient
     without: float | None = None  # for an optional term: prior standard deviation if the relation holds without it
-    times_speed: bool = False  # whether the coefficient is proportional to the speed (gyroscopic terms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +120,6 @@ class Own:
 
     parameter: str  # one of ``models.physics.rotor.PARAMETERS``
     terms: tuple[int, ...] = ()  # terms whose coefficients are proportional to it
-    # Whether these terms must have the sign of the first one, as a stiffness and a damping do; a fit with the other
-    # sign has not determined them.
-    resists: bool = True
     # Factor on the standard error if one source moves everything: all channels are then coherent, and as the same force
     # drives the omitted parts of the machine, their effect does not average out. Measured on finite-element rotors
     # (decision 0012).
@@ -163,19 +145,9 @@ class Row:
     rests_on: str = ""
 
     @property
-    def synchronous(self) -> bool:
-        """Whether the row is evaluated on the rotation-synchronous vectors."""
-        return bool(self.rests_on)
-
-    @property
     def n_coefficients(self) -> int:
         """Number of coefficients to learn."""
         return len(self.terms) - 1
-
-    @property
-    def needs_speed(self) -> bool:
-        """Whether the row cannot be evaluated without the speed."""
-        return self.synchronous or any(term.times_speed for term in self.terms)
 
     @property
     def motions(self) -> tuple[Motion, ...]:
@@ -183,9 +155,9 @@ class Row:
         return tuple(motion for term in self.terms for motion in term.motions)
 
 
-def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
+def _bearing(plane: str, number: str, direction: str) -> Row:
     one, two = f"{plane}1", f"{plane}2"
-    return (
+    terms = (
         Term((Motion(one, 0),)),
         Term((Motion(one, 1),)),
         Term((Motion(two, 2),)),
@@ -193,23 +165,17 @@ def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
         Term((Motion(one, 2),), spread=0.4, in_units_of=2, about=0.4),
         Term((Motion(two, 0), Motion(one, 0, -1.0)), spread=0.5, without=0.02),
     )
-
-
-def _bearing(plane: str, number: str, direction: str) -> Row:
     own = (
         Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True),
         Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03),
     )
-    return Row(plane, number, f"bearing and disc, {direction}", _bearing_and_disc(plane), own)
+    return Row(plane, number, f"bearing and disc, {direction}", terms, own)
 
 
 def _unbalance(bearing: Row) -> Row:
-    name, number, title = (
-        f"{bearing.name} 1x",
-        f"{bearing.number} at the speed",
-        f"unbalance force through {bearing.title}",
-    )
-    return Row(name, number, title, bearing.terms, (Own("e", one_source=1.4),), rests_on=bearing.name)
+    number, title = f"{bearing.number} at the speed", f"unbalance force through {bearing.title}"
+    own = (Own("e", one_source=1.4),)
+    return Row(f"{bearing.name} 1x", number, title, bearing.terms, own, rests_on=bearing.name)
 
 
 _BEARINGS = _bearing("y", "28 + 29", "horizontal"), _bearing("z", "31 + 29 in z", "vertical")
@@ -227,6 +193,16 @@ COUPLED_ROWS = tuple(_coupled(row) for row in ROWS)
 """The same rows for a bearing whose force has a component across its motion, as with an oil film or a gear mesh."""
 
 
+def learned_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Rows that are learned on the stochastic part of the signals."""
+    return tuple(row for row in rows if not row.rests_on)
+
+
+def consecutive(sizes: Iterable[int]) -> tuple[slice, ...]:
+    """Slice of each part, for example the coefficients of one row, in the vector of all parts."""
+    return tuple(slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
+
+
 def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
     """Parameters that rows read, in the order of ``models.physics.rotor.PARAMETERS``."""
     read = {own.parameter for row in rows for own in row.own}
@@ -240,8 +216,8 @@ def evaluable_rows(states: Sequence[str], has_phase_reference: bool) -> list[tup
     """
     found = []
     for row in ROWS:
-        reasons = [not_measured(row.motions, tuple(states))]
-        if row.needs_speed and not has_phase_reference:
-            reasons.append(_NO_PHASE)
-        found.append((row, "; ".join(reason for reason in reasons if reason)))
+        reasons = [not_measured(row.motions, states)]
+        if row.rests_on and not has_phase_reference:
+            reasons.append("no phase reference, and no speed to look for in the vibration")
+        found.append((row, "; ".join(filter(None, reasons))))
     return found

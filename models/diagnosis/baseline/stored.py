@@ -1,36 +1,70 @@
-"""A baseline as JSON: some hundred numbers and no code.
+"""The baseline of a machine without parameters, and its JSON: some hundred numbers and no code.
 
 Numbers are written with as many digits as needed to read back the same bits, so that a restored baseline gives the same
 diagnoses as the one that was stored.
 """
 
-import json
-from dataclasses import asdict
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
-from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.growth import Growth
-from models.diagnosis.baseline.learned import NO_FORCE, Baseline, LeftOut
-from models.diagnosis.baseline.numbers import Covariance, Positive, Spectra
+from models.diagnosis.baseline.conditions import Growth
+from models.diagnosis.baseline.numbers import Covariance, NotNegative, Positive, Spectra
 from models.diagnosis.baseline.relation import Relation
+from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, learned_rows
 from models.diagnosis.baseline.unbalance import SynchronousVectors
+from models.signals.block import FloatArray
 
 
-class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
-    """A `Baseline`, as plain numbers."""
+@dataclass(frozen=True, slots=True)
+class HeldOutReading:
+    """One parameter of one healthy window, read against the relation learned in the other conditions."""
+
+    parameter: str
+    # Relative change and its standard error, including the relation's error.
+    change: FiniteFloat
+    standard_error: Positive
+
+    @property
+    def z(self) -> float:
+        """Change in standard errors: standard normal if one relation holds for all."""
+        return self.change / self.standard_error
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """One healthy window of one row, read against the relation learned in the other conditions."""
+
+    row: str  # name of the row
+    window: Annotated[int, Field(ge=0)]  # number of the window, from 0
+    condition: str  # condition of the window
+    agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
+    misfit: NotNegative  # χ² of the residual per degree of freedom
+    degrees_of_freedom: Annotated[int, Field(ge=1)]
+
+
+NO_FORCE: FloatArray = np.zeros((0, 0, 0))
+
+
+class Baseline(BaseModel, extra="forbid", frozen=True, strict=True):
+    """Everything learned on a healthy machine."""
 
     format: Literal[1] = 1
-    relations: tuple[Relation | None, ...]  # one for each learned row, or null
-    reasons: tuple[str, ...]  # why a row has no relation
-    covariance: Covariance  # of the coefficients of all rows
-    rotations: tuple[SynchronousVectors, ...]  # synchronous vectors by speed
-    duration_s: Positive
-    consistency: tuple[LeftOut, ...] = ()  # healthy windows against each other
-    # Cross-spectra of the rows' residuals by bands; empty if the healthy recordings had several conditions.
+    relations: tuple[Relation | None, ...]  # one for each learned row of the table; None if it has no relation
+    reasons: tuple[str, ...]  # why a row has no relation; empty if it has one
+    # (n, n): of the coefficients of all rows one after the other; zero for rows without a relation
+    covariance: Covariance
+    # Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
+    rotations: tuple[SynchronousVectors, ...]
+    duration_s: Positive  # length of the healthy data
+    # Every healthy window of every row, read against the relation learned in the other conditions.
+    consistency: tuple[LeftOut, ...] = ()
+    # (n_bands, n_rows, n_rows): force that the relations were learned under (`force_spectrum`); empty with several
+    # conditions, or if a row has no relation
     force: Spectra = Field(default_factory=NO_FORCE.copy, exclude_if=lambda bands: not len(bands))
-    # One for each learned row, or null; empty in older records.
+    # Growth of the stiffness of each learned row with the motion; None if unknown, empty in older records.
     growth: tuple[Growth | None, ...] = Field(default=(), exclude_if=lambda rows: not rows)
 
     @model_validator(mode="after")
@@ -60,26 +94,18 @@ class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
         return self
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, BaselineRecord) and self.model_dump_json() == other.model_dump_json()
+        return isinstance(other, Baseline) and self.model_dump_json() == other.model_dump_json()
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())
 
-    @classmethod
-    def of(cls, baseline: Baseline) -> Self:
-        """Make the record of a baseline.
+    @property
+    def without_force(self) -> Self:
+        """The same without the force: readings get the errors of other conditions, whatever moves the machine."""
+        return self.model_copy(update={"force": NO_FORCE})
 
-        Raises
-        ------
-        pydantic.ValidationError
-            If a number in it is not finite.
-        """
-        return cls.model_validate_json(json.dumps(asdict(baseline), default=lambda numbers: numbers.tolist()))
-
-    def diagnostician(self) -> BaselineDiagnostician:
-        """Diagnostician that reads windows against the baseline."""
-        return BaselineDiagnostician(self.baseline())
-
-    def baseline(self) -> Baseline:
-        """The baseline, to the last bit."""
-        return Baseline(**{name: value for name, value in self if name != "format"})
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The shipped table of rows that the baseline was learned with."""
+        n_coupled = sum(row.n_coefficients for row in learned_rows(COUPLED_ROWS))
+        return COUPLED_ROWS if len(self.covariance) == n_coupled else ROWS

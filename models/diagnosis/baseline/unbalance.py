@@ -7,13 +7,13 @@ unbalance. Velocities and accelerations are displacements times jΩ and -Ω².
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
-from models.diagnosis.baseline.numbers import Covariance, Number, Vector
+from models.diagnosis.baseline.numbers import Covariance, Vector
 from models.diagnosis.baseline.rows import Row, lowest, state_of
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
@@ -31,7 +31,7 @@ class SynchronousVectors:
     coordinates: Annotated[tuple[str, ...], Field(min_length=1)]  # for example y1, y2, z1, z2
     vectors: Vector  # (2 n,), real parts of the displacements, then their imaginary parts, m
     covariance: Covariance  # (2 n, 2 n), from the stochastic part near the speed
-    speed_rad_s: Number
+    speed_rad_s: FiniteFloat
     # Whether angles are relative to the phase reference; otherwise only angles between coordinates are meaningful.
     absolute: bool = True
 
@@ -41,7 +41,7 @@ class SynchronousVectors:
         keep = [self.coordinates.index(name) for name in coordinates]
         keep = [*keep, *(n + number for number in keep)]
         covariance = self.covariance[np.ix_(keep, keep)]
-        return SynchronousVectors(coordinates, self.vectors[keep], covariance, self.speed_rad_s, self.absolute)
+        return replace(self, coordinates=coordinates, vectors=self.vectors[keep], covariance=covariance)
 
     @property
     def largest(self) -> str:
@@ -55,8 +55,7 @@ class SynchronousVectors:
         angle = np.arctan2(self.vectors[n + at], self.vectors[at])
         c, s = np.cos(angle) * np.eye(n), np.sin(angle) * np.eye(n)
         turn = np.block([[c, s], [-s, c]])
-        covariance = turn @ self.covariance @ turn.T
-        return SynchronousVectors(self.coordinates, turn @ self.vectors, covariance, self.speed_rad_s, absolute=False)
+        return replace(self, vectors=turn @ self.vectors, covariance=turn @ self.covariance @ turn.T, absolute=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,20 +121,18 @@ def rotations_by_speed(found: Sequence[SynchronousVectors]) -> tuple[Synchronous
     if not all(one.absolute for one in found):
         reference = found[0].largest
         found = [one.turned(reference) for one in found]
-    left = sorted(found, key=lambda one: one.speed_rad_s)
     groups: list[list[SynchronousVectors]] = []
-    for one in left:
+    for one in sorted(found, key=lambda one: one.speed_rad_s):
         if groups and one.speed_rad_s / groups[-1][0].speed_rad_s - 1 <= SPEED_TOLERANCE:
             groups[-1].append(one)
         else:
             groups.append([one])
     return tuple(
-        SynchronousVectors(
-            coordinates=near[0].coordinates,
+        replace(
+            near[0],
             vectors=np.mean([one.vectors for one in near], axis=0),
             covariance=np.sum([one.covariance for one in near], axis=0) / len(near) ** 2,
             speed_rad_s=float(np.mean([one.speed_rad_s for one in near])),
-            absolute=near[0].absolute,
         )
         for near in groups
     )
@@ -192,8 +189,7 @@ def _terms(row: Row, vectors: SynchronousVectors) -> ComplexArray:
     terms = np.zeros((len(row.terms), len(vectors.coordinates)), dtype=np.complex128)
     for found, term in zip(terms, row.terms, strict=True):
         for motion in term.motions:
-            factor = motion.factor * (speed if term.times_speed else 1.0)
-            found[vectors.coordinates.index(motion.coordinate)] += factor * (1j * speed) ** motion.order
+            found[vectors.coordinates.index(motion.coordinate)] += motion.factor * (1j * speed) ** motion.order
     return terms
 
 

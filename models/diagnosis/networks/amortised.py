@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from scipy.linalg import block_diag
 
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
-from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
+from models.diagnosis.readings import Diagnosis, beyond, no_reading, not_determined, parameter_reading
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, changed
@@ -206,36 +206,28 @@ class NetworkDiagnostician:
         own = slice(basis.n_common - n, basis.n_common)
         raw = inputs[:, own] * basis.scale[own] + basis.centre[own]
         apart = {name: float(value[0]) for name, value in self._features.disagreement(raw).items()}
-        return ", ".join(
-            f"{name} by {beyond(100 * value, 100 * _MOST_APART)[0]} %"
-            for name, value in apart.items()
-            if value > _MOST_APART
-        )
+        far = {name: value for name, value in apart.items() if value > _MOST_APART}
+        return ", ".join(f"{name} by {beyond(100 * value, 100 * _MOST_APART)[0]} %" for name, value in far.items())
 
     def _read(
         self, equation: str, mean: FloatArray, factor: FloatArray, calibrations: dict[str, Calibration]
     ) -> tuple[list[Parameter], FloatArray]:
         """Readings of one equation's parameters, and the covariance of those with a number."""
-        amortised = self._amortised
-        covariance = factor @ factor.T
+        covariance, most = factor @ factor.T, self._amortised.log_range
         readings, kept, scales = [], [], []
         for position, name in enumerate(OWN[equation]):
             log_ratio, deviation = float(mean[position]), float(np.sqrt(covariance[position, position]))
-            calibration = calibrations.get(name)
-            scale = 1.0
+            calibration, scale = calibrations.get(name), 1.0
             if calibration is not None:
                 log_ratio -= calibration.bias
                 scale = float(calibration.scale(np.array(deviation)))
             ratio = float(np.exp(log_ratio))
             error = ratio * scale * deviation
-            if abs(log_ratio) > amortised.log_range:
-                low, high = np.expm1(-amortised.log_range), np.expm1(amortised.log_range)
-                reason = f"beyond the changes trained for ({low:+.0%} to {high:+.0%})"
+            if abs(log_ratio) > most:
+                reason = f"beyond the changes trained for ({np.expm1(-most):+.0%} to {np.expm1(most):+.0%})"
                 readings.append(no_reading(name, self.by, reason))
             elif not error < _VAGUE:
-                text, limit = beyond(100 * error, 100 * _VAGUE)
-                reason = f"not determined in this window (standard error {text} %, limit for a reading {limit} %)"
-                readings.append(no_reading(name, self.by, reason))
+                readings.append(no_reading(name, self.by, not_determined(error, _VAGUE)))
             else:
                 readings.append(parameter_reading(name, self.by, ratio - 1, error))
                 kept.append(position)

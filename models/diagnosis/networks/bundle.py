@@ -13,7 +13,7 @@ Loading refuses a bundle that is damaged or was trained for another machine, and
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -44,9 +44,7 @@ SHIPPED_BUNDLES = Path(__file__).parents[2] / "bundles"
 _Array = np.ndarray[Any, np.dtype[Any]]
 _Arrays = dict[str, _Array]
 _FORMAT = 2
-_PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
-_BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
-_ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
+_PHYSICS = {"rotor", "operation", "condition", "rate_hz", "window"}
 # By hash of the file and name of the array: machines with the same bundle share its weights while any of them uses it.
 _shared: WeakValueDictionary[tuple[str, str], _Array] = WeakValueDictionary()
 
@@ -128,7 +126,7 @@ def _canonical(manifest: Manifest) -> bytes:
 
 
 def _physics(machine: Machine) -> dict[str, Any]:
-    return json.loads(json.dumps(machine.model_dump(mode="json", include=set(_PHYSICS))))  # type: ignore[no-any-return]
+    return machine.model_dump(mode="json", include=_PHYSICS)
 
 
 def save_bundle(
@@ -151,8 +149,7 @@ def save_bundle(
         number, healthy = trained.equation.number, trained.healthy
         if healthy is None:
             raise BundleError(f"{directory}: equation {number} has no healthy spread: calibrate it before saving")
-        for name in _ARRAYS:
-            arrays[f"{number}.{name}"] = np.ascontiguousarray(getattr(trained.network, name))
+        arrays |= _fields(trained.network, f"{number}.")
         entries.append(
             EquationEntry(
                 number=number,
@@ -191,14 +188,9 @@ def save_bundle(
 
 
 def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
-    """Load a bundle and check that it belongs to a machine.
+    """Load a bundle, shipped (``lab``) or from a directory, and check that it belongs to a machine.
 
-    Parameters
-    ----------
-    name_or_path : str or Path
-        "lab" (shipped), or a directory.
-    machine : Machine
-        The machine it must have been trained for: rotor, operation, condition range, rate and window.
+    It must have been trained for the machine's rotor, operation, condition range, rate and window.
 
     Raises
     ------
@@ -271,25 +263,29 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
             raise BundleError(f"{where}: {field} are {found}, this program expects {expected}")
     n_inputs = len(equation.input_names)
     shapes = {"input_scale": (n_inputs,), "W1": (n_inputs, HIDDEN), "b1": (HIDDEN,), "W2": (HIDDEN,), "b2": (1,)}
-    parts = []
-    for name in _ARRAYS:
-        array = arrays.get(f"{entry.number}.{name}")
-        array = _finite(array, np.dtype(np.float64), shapes[name], f"{where}: weight {name}")
-        if name == "input_scale" and not np.all(array > 0):
-            raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
-        parts.append(array)
-    return EquationNetwork(equation, Network(*parts), healthy)
+    parts = {
+        name: _finite(arrays, f"{entry.number}.{name}", np.dtype(np.float64), shape, f"{where}: weight {name}")
+        for name, shape in shapes.items()
+    }
+    if not np.all(parts["input_scale"] > 0):
+        raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
+    return EquationNetwork(equation, Network(**parts), healthy)
 
 
-def _finite(array: _Array | None, kind: np.dtype[Any], shape: tuple[int, ...], what: str) -> _Array:
+def _finite(arrays: _Arrays, name: str, kind: np.dtype[Any], shape: tuple[int, ...], what: str) -> _Array:
+    array = arrays.get(name)
     if array is None or array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
         state = "missing" if array is None else f"{array.dtype}{array.shape}"
         raise BundleError(f"{what} is {state}, expected finite {kind}{shape}")
     return array
 
 
+def _fields(part: Network | FeatureBasis, prefix: str) -> _Arrays:
+    return {f"{prefix}{one.name}": np.ascontiguousarray(getattr(part, one.name)) for one in fields(part)}
+
+
 def _amortised_arrays(amortised: AmortisedNetworks | NearNetworks, stage: str = "") -> _Arrays:
-    arrays: _Arrays = {f"{stage}basis.{name}": np.ascontiguousarray(getattr(amortised.basis, name)) for name in _BASIS}
+    arrays = _fields(amortised.basis, f"{stage}basis.")
     for network in amortised.networks:
         where = f"{stage}amortised.{network.equation}"
         for number, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
@@ -327,22 +323,17 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
     for name, one in (*entry.calibration.items(), *entry.coherent.items()):
         if len(one.log_deviation) != len(one.z_scale) or list(one.log_deviation) != sorted(one.log_deviation):
             raise BundleError(f"{where}: calibration of {name}: expected ascending log_deviation, one z_scale for each")
-    basis, networks = _stage(where, entry, arrays, "")
-    near = None
-    if entry.near is not None:
-        if entry.near != NEAR:
-            raise BundleError(f"{where}: remainders are {entry.near}, this program expects {NEAR}")
-        near = NearNetworks(*_stage(where, entry, arrays, "near."))
+    if entry.near not in (None, NEAR):
+        raise BundleError(f"{where}: remainders are {entry.near}, this program expects {NEAR}")
     return AmortisedNetworks(
         entry.channels,
-        basis,
-        networks,
-        entry.calibration,
-        entry.novelty_limit,
-        entry.log_range,
-        entry.coherent,
-        entry.coherence_limit,
-        near,
+        *_stage(where, entry, arrays, ""),
+        calibration=entry.calibration,
+        novelty_limit=entry.novelty_limit,
+        log_range=entry.log_range,
+        coherent=entry.coherent,
+        coherence_limit=entry.coherence_limit,
+        near=None if entry.near is None else NearNetworks(*_stage(where, entry, arrays, "near.")),
     )
 
 
@@ -370,10 +361,10 @@ def _stage(
             shapes[f"amortised.{number}.b{layer}"] = (n_out,)
         shapes[f"amortised.{number}.direct"] = (first, own)
     own_arrays = {
-        name: _finite(arrays.get(f"{stage}{name}"), np.dtype(np.float32), shape, f"{where}: {stage}{name}")
+        name: _finite(arrays, f"{stage}{name}", np.dtype(np.float32), shape, f"{where}: {stage}{name}")
         for name, shape in shapes.items()
     }
-    basis = FeatureBasis(*(own_arrays[f"basis.{name}"] for name in _BASIS))
+    basis = FeatureBasis(*(own_arrays[f"basis.{one.name}"] for one in fields(FeatureBasis)))
     layers = range(1, len(LAYERS) + 2)
     return basis, tuple(
         AmortisedNetwork(

@@ -40,16 +40,13 @@ def calibrate(
     parameters that the equation assumes unchanged are nominal. `changed` has one group for each layout of the sources;
     the group with the heaviest tails determines the degrees of freedom.
     """
-    raw = EquationNetwork(trained.equation, trained.network, None)
+    raw = replace(trained, healthy=None)
     names = trained.equation.parameters
 
     def read(window: WindowStatistics) -> tuple[float, list[float], list[float]]:
         one = read_equation(raw, window, machine)
-        return (
-            one.msd or 0.0,
-            [reading.relative_change or 0.0 for reading in one.parameters],
-            [reading.standard_error or 0.0 for reading in one.parameters],
-        )
+        own = [(reading.relative_change or 0.0, reading.standard_error or 0.0) for reading in one.parameters]
+        return one.msd or 0.0, [change for change, _ in own], [error for _, error in own]
 
     groups = [
         [(*read(window)[1:], [changes.get(name, 0.0) for name in names]) for window, changes in group]
@@ -60,19 +57,16 @@ def calibrate(
     z_scale, floor, gain, freedom = (tuple(part) for part in zip(*fitted, strict=True))
     still = [read(window)[:2] for window in healthy]
     spread = np.median(np.abs([change for _, change in still]), axis=0) * _MAD / np.array(gain)
-    return EquationNetwork(
-        trained.equation,
-        trained.network,
-        Healthy(
-            windows=len(still) + sum(map(len, groups)),
-            msd=float(np.mean([msd for msd, _ in still])),
-            z_scale=z_scale,
-            spread=tuple(spread.tolist()),
-            floor=floor,
-            gain=gain,
-            freedom=freedom,
-        ),
+    healthy_figures = Healthy(
+        windows=len(still) + sum(map(len, groups)),
+        msd=float(np.mean([msd for msd, _ in still])),
+        z_scale=z_scale,
+        spread=tuple(spread.tolist()),
+        floor=floor,
+        gain=gain,
+        freedom=freedom,
     )
+    return replace(trained, healthy=healthy_figures)
 
 
 def _relation_errors(groups: Sequence[FloatArray]) -> tuple[float, float, float, float]:

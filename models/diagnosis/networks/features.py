@@ -46,7 +46,8 @@ class ForceFeatures:
         self._near = near
         self._duration_s = plan.hops * plan.hop / plan.rate_hz
         index = np.array([STATE_INDEX[name] for name in self.states])
-        self._dofs = sorted(set(index % 6))
+        self._dofs, self._rates = sorted(set(index % 6)), index >= 6
+        self._rows = np.searchsorted(self._dofs, index % 6)
         self._pairs = tuple((i, j) for i in range(len(self._dofs)) for j in range(i))
         self._measured_twice = tuple(
             (self.states.index(name), self.states.index(f"{name}_dot"))
@@ -66,8 +67,6 @@ class ForceFeatures:
     def _take(self, machine: Machine) -> None:
         self._machine = machine
         rotor = machine.rotor
-        rows = [self._dofs.index(STATE_INDEX[name] % 6) for name in self.states]
-        self._rows, self._rates = np.array(rows), np.array([STATE_INDEX[name] >= 6 for name in self.states])
         self._corners_rad_s = self._corners()[self._rows]
         # Matrices multiplied by 1, ω², jω and jωΩ (gyroscopic); measured degrees of freedom first.
         still = P_matrix(rotor, 0.0)

@@ -63,11 +63,6 @@ class Healthy(BaseModel, extra="forbid", frozen=True):
     gain: tuple[_Positive, ...] = ()
     freedom: tuple[_Positive, ...] = ()  # degrees of freedom of the errors (Student's t); empty if normal
 
-    def stated(self, change: FloatArray, scatter: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Calibrated changes and standard errors, from the projected residual and its scatter."""
-        error = np.hypot(np.multiply(self.z_scale, scatter), self.floor or 0.0)
-        return change / (self.gain or 1.0), error
-
 
 @dataclass(frozen=True, slots=True)
 class EquationNetwork:
@@ -113,18 +108,16 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
-        change, error = healthy.stated(change, error)
-    readings = tuple(
-        possible_reading(name, "relation", float(value), float(spread))
-        for name, value, spread in zip(equation.parameters, change, error, strict=True)
-    )
+        change = change / (healthy.gain or 1.0)
+        error = np.hypot(np.multiply(healthy.z_scale, error), healthy.floor or 0.0)
+    readings = zip(equation.parameters, change.tolist(), error.tolist(), strict=True)
     return EquationReading(
         equation=equation.number,
         title=equation.title,
         evaluable=True,
         msd=float(np.mean(residual**2)),
         msd_healthy=None if healthy is None else healthy.msd,
-        parameters=readings,
+        parameters=tuple(possible_reading(name, "relation", value, spread) for name, value, spread in readings),
     )
 
 
@@ -167,10 +160,8 @@ class RelationDiagnostician:
         equations: list[EquationReading] = []
         parameters: list[Parameter] = []
         for equation in EQUATIONS:
-            trained = self._networks.get(equation.number)
-            if trained is None:
-                reading = not_read(equation, "no trained network")
-            else:
+            trained, reading = self._networks.get(equation.number), not_read(equation, "no trained network")
+            if trained is not None:
                 reading = read_equation(trained, window, self._machine)
             equations.append(reading)
             parameters += reading.parameters or [

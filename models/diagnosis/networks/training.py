@@ -36,12 +36,7 @@ def train_network(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> EquationNetwork:
-    """Fit the network of one equation, without calibrating it.
-
-    Parameters
-    ----------
-    windows : sequence of WindowStatistics
-        Own parameters nominal, everything else random.
+    """Fit the network of one equation, without calibrating it, to windows that differ in all but its own parameters.
 
     Raises
     ------
@@ -111,11 +106,10 @@ class _Learner:
         self.weights[-1] *= 0.1
         self.biases = [torch.zeros(b) for b in sizes[1:]]
         self.direct = torch.zeros(n_inputs, p)
-        parts = [*self.weights, *self.biases, self.direct]
-        for part in parts:
+        self.parts = [*self.weights, *self.biases, self.direct]
+        for part in self.parts:
             part.requires_grad_(True)
-        self.parts = parts
-        self.optimiser = torch.optim.AdamW(parts, lr=_RATE, weight_decay=_WEIGHT_DECAY)
+        self.optimiser = torch.optim.AdamW(self.parts, lr=_RATE, weight_decay=_WEIGHT_DECAY)
 
     def step(self, inputs: torch.Tensor, log_ratio: torch.Tensor, rate: float) -> None:
         """Take one step on a batch."""
@@ -167,10 +161,8 @@ def train_networks(
 
     Parameters
     ----------
-    states : tuple of str
-        Measured states that the features were made of.
-    principal : tuple of ndarray
-        Mean and directions with which they were condensed.
+    states, principal : tuple
+        Measured states that the features were made of; mean and directions with which they were condensed.
     n_common : int
         Number of features that all networks share; the rest are for equation 29.
     batches : iterable of (features, logarithmic ratios)
@@ -179,8 +171,6 @@ def train_networks(
         Number of windows in all batches together, for the schedule of the learning rate.
     log_range : float or ndarray, shape (6,)
         Largest drawn logarithmic ratio of each of `PARAMETERS`.
-    seed : int
-        For the initial weights and the choice from the buffer.
     progress : callable
         Called with the number of windows of each batch.
 

@@ -207,9 +207,7 @@ def beside(first: Diagnosis, second: Diagnosis) -> Diagnosis:
 _POWER = 0.95
 
 
-def detectable_changes(
-    stretch: Stretch, thresholds: Thresholds, length_s: float, power: float = _POWER
-) -> tuple[Detectable, ...]:
+def detectable_changes(stretch: Stretch, thresholds: Thresholds, length_s: float) -> tuple[Detectable, ...]:
     """Minimum detectable changes of a stretch of data, from its own information.
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
@@ -217,7 +215,7 @@ def detectable_changes(
     from a change of any other parameter; where estimates are correlated, the power with which it is found is therefore
     higher than stated. The errors of a parameter hardly depend on its value.
     """
-    distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
+    distance, errors = thresholds.first + float(ndtri(_POWER)), np.sqrt(np.diag(stretch.estimate[1])).tolist()
     return tuple(
         Detectable(
             name=name,

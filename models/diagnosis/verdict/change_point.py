@@ -54,7 +54,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     """
     last = windows[-1]
     known = list(last.known)
-    own, values = last.estimate()[1], np.array([one.estimate()[0] for one in windows])
+    own, values = last.estimate[1], np.array([one.estimate[0] for one in windows])
     shared = np.zeros_like(own) if last.common is None else last.common[np.ix_(known, known)]
     whiten = np.linalg.inv(np.linalg.cholesky(own + shared))
     seen = values @ whiten.T

@@ -16,7 +16,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, compress
 
 import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
@@ -87,7 +87,7 @@ def misfit_beside(stretch: Stretch, names: Collection[str]) -> float:
     misfit_z, others = look.misfit_z or 0.0, [at for at, name in enumerate(look.names) if name not in names]
     if not others:
         return misfit_z
-    values, covariance = look.estimate()
+    values, covariance = look.estimate
     chi2 = float(values[others] @ np.linalg.solve(covariance[np.ix_(others, others)], values[others]))
     return max(misfit_z, -float(ndtri(max(chdtrc(len(others), chi2), 1e-300))))
 
@@ -99,7 +99,7 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
     probability = np.zeros(len(PARAMETERS))
     if not known:
         return Isolation((), 1.0, tuple(probability.tolist()), (), outside, confidence)
-    sets, members = _sets(len(known)), _members(len(known))
+    members = _members(len(known))
     J = stretch.information[np.ix_(known, known)]
     b = stretch.vector[list(known)]
     explained = _explained(J, b, members)
@@ -115,7 +115,7 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
     weight /= weight.sum()
     best = int(np.argmax(gain))
     probability[list(known)] = weight @ members
-    changed = tuple(PARAMETERS[known[i]] for i in sets[best])
+    changed = tuple(compress(stretch.names, members[best]))
     return Isolation(
         changed=changed,
         confidence=float(weight[best]),
@@ -123,7 +123,7 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         readings=restricted(stretch, changed, by),
         outside=outside,
         outside_confidence=confidence,
-        alternatives=_alternatives(sets, known, weight, explained) if changed else (),
+        alternatives=_alternatives(stretch.names, members, weight, explained) if changed else (),
     )
 
 
@@ -135,14 +135,14 @@ def _pair_price(first: float, n: int) -> float:
 
 
 def _alternatives(
-    sets: tuple[tuple[int, ...], ...], known: tuple[int, ...], weight: FloatArray, explained: FloatArray
+    names: tuple[str, ...], members: FloatArray, weight: FloatArray, explained: FloatArray
 ) -> tuple[Alternative, ...]:
     """The most probable sets, each parameter by itself, and the empty set: what a reader would ask for."""
     likeliest = np.argsort(-weight)[:_LIKELIEST].tolist()
-    simple = [number for number, one in enumerate(sets) if len(one) < 2]
+    simple = np.flatnonzero(members.sum(axis=1) < 2).tolist()
     return tuple(
         Alternative(
-            names=tuple(PARAMETERS[known[i]] for i in sets[number]),
+            names=tuple(compress(names, members[number])),
             probability=min(1.0, float(weight[number])),
             explained=min(1.0, max(0.0, float(explained[number] / explained[-1]))),
         )
@@ -151,15 +151,10 @@ def _alternatives(
 
 
 @lru_cache
-def _sets(n: int) -> tuple[tuple[int, ...], ...]:
-    """All subsets of n parameters, the empty one first, small ones before large ones."""
-    return tuple(A for size in range(n + 1) for A in combinations(range(n), size))
-
-
-@lru_cache
 def _members(n: int) -> FloatArray:
-    """One for each parameter that a set holds, shape (n_sets, n)."""
-    return np.array([[float(i in A) for i in range(n)] for A in _sets(n)])
+    """All sets of n parameters, the empty one first, small ones before large ones: 1 if it is in one, (n_sets, n)."""
+    sets = [A for size in range(n + 1) for A in combinations(range(n), size)]
+    return np.array([[float(i in A) for i in range(n)] for A in sets])
 
 
 def _explained(J: FloatArray, b: FloatArray, members: FloatArray) -> FloatArray:
@@ -189,6 +184,6 @@ def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float)
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
     # If errors put an unbalance that has almost vanished below zero, it is one of that size on the other side.
-    own = float(stretch.estimate()[0][stretch.names.index(name)])
+    own = float(stretch.estimate[0][stretch.names.index(name)])
     vector = None if stretch.unbalance is None else stretch.unbalance.read_as(value, own)
     return possible_reading(name, by, abs(1 + value) - 1, error, vector)

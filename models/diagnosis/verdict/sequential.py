@@ -101,13 +101,9 @@ class SequentialTest:
         # Why no parameter is named or read at the latest hop, see `Diagnosis`; empty if it is evaluable.
         self.unexplained = ""
         self._by = by
-        self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
+        self._thresholds = settings.thresholds
         self._contradiction = window_thresholds(_CONTRADICTION_RATE, len(PARAMETERS)).first
         self._slack_ns = round(settings.hop_s * 0.5e9)
-
-    def thresholds(self, hops: int) -> Thresholds:
-        """Thresholds of the stretches of one length, hops."""
-        return self._thresholds[hops]
 
     def clear(self) -> None:
         """Forget everything: the data's clock was set, or another machine is watched."""
@@ -178,21 +174,22 @@ class SequentialTest:
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
         # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.
-        outside, confidence = False, None
+        by, unexplained, outside, confidence = None, "", False, None
         if deciding:
-            outside, confidence = model_test(clean[deciding[-1]], self._thresholds[deciding[-1]])
-        unexplained = clean[deciding[-1]].unexplained if deciding else ""
-        by = clean[deciding[-1]] if deciding else None
+            by = clean[deciding[-1]]
+            unexplained = by.unexplained
+            outside, confidence = model_test(by, self._thresholds(deciding[-1]))
         outside = self._is_outside(outside or bool(unexplained), by, own[window_hops])
-        loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
-        verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
+        loud = {hops: look for hops, look in every.items() if self._is_loud(hops, look)}
+        found = {hops: isolate(look, self._thresholds(hops), self._by) for hops, look in loud.items()}
+        verdicts = {hops: verdict for hops, verdict in found.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
         if unexplained:
             # Earlier findings stay: data that say nothing neither confirm nor withdraw them.
-            isolation = replace(isolation, changed=(), readings=())
+            isolation = replace(isolation, changed=())
         else:
             self._note(isolation.changed, every, clean, verdicts)
-        current = self._current_readings(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
+        current = () if by is None or unexplained else self._current_readings(by, isolation.changed)
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
         either = foreign and not outside and findings != () and {one.name for one in findings} <= set(rivals)
@@ -215,13 +212,8 @@ class SequentialTest:
 
     def _is_loud(self, hops: int, look: Stretch) -> bool:
         """Whether a stretch may name anything: no set explains more than all parameters together."""
-        if not look.known:
-            return False
-        values, _ = look.estimate()
-        return float(values @ look.vector[list(look.known)]) > self._thresholds[hops].first ** 2
-
-    def _isolate(self, hops: int, look: Stretch) -> Isolation:
-        return isolate(look, self._thresholds[hops], self._by)
+        explained = float(look.estimate[0] @ look.vector[list(look.known)])
+        return explained > self._thresholds(hops).first ** 2
 
     def _accumulate(self, window: Stretch) -> dict[int, Stretch]:
         """Add the window to what is remembered; returns it and the sums of windows that end with it."""
@@ -256,7 +248,7 @@ class SequentialTest:
             return True
         if state.outside_ns is not None and (by is None or by.start_ns > window.start_ns):
             lasting_s = (window.end_ns - state.outside_ns) / 1e9
-            whole = model_test(window, self._thresholds[self.settings.window_hops])[0] or bool(window.unexplained)
+            whole = model_test(window, self._thresholds(self.settings.window_hops))[0] or bool(window.unexplained)
             doubtful = by is not None and (by.misfit_z is None or by.misfit_z > _INSIDE)
             if (whole and doubtful) or lasting_s >= self.settings.window_hops * self.settings.hop_s:
                 return True
@@ -278,7 +270,7 @@ class SequentialTest:
         for at, (hops, short) in enumerate(clean):
             if hops > self.settings.window_hops:
                 return
-            explained = short.known and not short.unexplained and not model_test(short, self._thresholds[hops])[0]
+            explained = short.known and not short.unexplained and not model_test(short, self._thresholds(hops))[0]
             worst = _differences(values[at], values[at + 1 :])
             for (_, longer), whole, differs in zip(clean[:at:-1], values[:at:-1], worst[::-1], strict=True):
                 if differs > self._contradiction or (explained and longer.unexplained):
@@ -311,8 +303,8 @@ class SequentialTest:
                 if leader is not None:
                     return look, leader
         shown = self.settings.window_hops if self.settings.window_hops in clean else min(clean, default=min(every))
-        verdict = self._isolate(shown, every[shown])  # nothing that a straddling stretch names is believed
-        return every[shown], replace(verdict, changed=(), readings=())
+        verdict = isolate(every[shown], self._thresholds(shown), self._by)
+        return every[shown], replace(verdict, changed=())  # nothing that a straddling stretch names is believed
 
     def _leader(self, look: Stretch, verdict: Isolation, clean: Mapping[int, Stretch]) -> Isolation | None:
         """What a straddling stretch may name: the parameter that moved most, if it moved away from nominal.
@@ -332,8 +324,7 @@ class SequentialTest:
             now, now_variances = _values(clean[max(clean)])
             if abs(now[most] - values[most]) > self._contradiction * np.sqrt(now_variances[most]):
                 return None
-        readings = tuple(reading for reading in verdict.readings if reading.name == PARAMETERS[most])
-        return replace(verdict, changed=(PARAMETERS[most],), readings=readings)
+        return replace(verdict, changed=(PARAMETERS[most],))
 
     def _note(
         self,
@@ -366,7 +357,7 @@ class SequentialTest:
 
     def _current_readings(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
         """Free readings of a stretch; those of changed parameters are means over what else may have changed."""
-        values, covariance = look.estimate()
+        values, covariance = look.estimate
         errors = np.sqrt(np.diag(covariance)).tolist()
         read = {name: (value, error) for name, value, error in zip(look.names, values.tolist(), errors, strict=True)}
         named = [i for i in look.known if PARAMETERS[i] in changed]
@@ -457,8 +448,6 @@ def _differences(part: tuple[FloatArray, FloatArray], wholes: Sequence[tuple[Flo
 def _values(look: Stretch) -> tuple[FloatArray, FloatArray]:
     """Values and variances of all `PARAMETERS`; 0 and infinity for what was not evaluable."""
     values, variances = np.zeros(len(PARAMETERS)), np.full(len(PARAMETERS), np.inf)
-    if look.known:
-        found, covariance = look.estimate()
-        values[list(look.known)] = found
-        variances[list(look.known)] = np.diag(covariance)
+    known, (found, covariance) = list(look.known), look.estimate
+    values[known], variances[known] = found, np.diag(covariance)
     return values, variances

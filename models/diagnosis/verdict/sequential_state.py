@@ -13,6 +13,7 @@ from rotorwatch.records.windows import Finding
 
 _LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
 _NO_LIMITS = (1, 0)  # for a date that has none
+_DATES = ("change_ns", "dated_ns", "outside_ns")
 
 
 @dataclass(slots=True)
@@ -31,13 +32,12 @@ class SequentialState:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything but the sums, which are in `hops`, as named arrays."""
+        dates = zip(_DATES, (self.change_ns, self.dated_ns, self.outside_ns), strict=True)
         rows = [(PARAMETERS.index(one.name), one.since_ns, one.found_ns) for one in self.findings]
         between = [one.between_ns or _NO_LIMITS for one in self.findings]
         oldest = [(windows, ring[0].end_ns) for windows, ring in self.sums.items() if ring]
         return {
-            "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
-            "dated_ns": np.array([] if self.dated_ns is None else [self.dated_ns], dtype=np.int64),
-            "outside_ns": np.array([] if self.outside_ns is None else [self.outside_ns], dtype=np.int64),
+            **{name: np.array([] if at is None else [at], dtype=np.int64) for name, at in dates},
             "before": np.array(self.before, dtype=np.float64),
             "between_ns": np.array(between, dtype=np.int64).reshape(-1, 2),
             "findings": np.array(rows, dtype=np.int64).reshape(-1, 3),
@@ -65,8 +65,6 @@ class SequentialState:
             If an array is missing or of another form.
         """
         state = cls(before=tuple(checked(arrays, "before", np.float64, (len(PARAMETERS),)).tolist()))
-        change_ns = checked(arrays, "change_ns", np.int64, (None,))
-        state.change_ns = int(change_ns[0]) if change_ns.size else None
         findings = checked(arrays, "findings", np.int64, (None, 3))
         lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
         if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
@@ -75,8 +73,9 @@ class SequentialState:
         never = np.zeros(0, np.int64)
         between = np.tile(_NO_LIMITS, (len(findings), 1))
         added = {"dated_ns": never, "outside_ns": never, "between_ns": between, **arrays}
-        state.dated_ns = next(iter(checked(added, "dated_ns", np.int64, (None,)).tolist()), None)
-        state.outside_ns = next(iter(checked(added, "outside_ns", np.int64, (None,)).tolist()), None)
+        state.change_ns, state.dated_ns, state.outside_ns = (
+            next(iter(checked(added, name, np.int64, (None,)).tolist()), None) for name in _DATES
+        )
         between = checked(added, "between_ns", np.int64, (len(findings), 2))
         state.findings = tuple(
             finding(PARAMETERS[number], since, found, length, (low, high) if low <= high else None)

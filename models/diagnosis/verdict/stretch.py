@@ -18,8 +18,8 @@ import numpy as np
 from models.diagnosis.readings import (
     Diagnosis,
     UnbalanceVector,
-    beyond,
     no_reading,
+    not_determined,
     parameter_reading,
     possible_reading,
 )
@@ -80,12 +80,9 @@ class Stretch:
         """From the oldest to the newest data, s."""
         return (self.end_ns - self.start_ns) / 1e9
 
+    @cached_property
     def estimate(self) -> tuple[FloatArray, FloatArray]:
         """Values of `names` in the scale of their errors, shape (m,), and their covariance, shape (m, m)."""
-        return self._estimate
-
-    @cached_property
-    def _estimate(self) -> tuple[FloatArray, FloatArray]:
         known = list(self.known)
         covariance = np.linalg.inv(self.information[np.ix_(known, known)])
         covariance = (covariance + covariance.T) / 2
@@ -110,17 +107,16 @@ class Stretch:
         if self.unbalance is None or not self.unbalance.foreign:
             return self
         at = [number for number, i in enumerate(self.known) if PARAMETERS[i] != "e"]
-        values, covariance = self.estimate()
-        known = [self.known[number] for number in at]
-        own = _stretch(self.start_ns, self.end_ns, known, values[at], covariance[np.ix_(at, at)], self.misfit_z)
-        return replace(own, common=self.common, unexplained=self.unexplained)
+        values, covariance = self.estimate
+        vector, information = _information(
+            [self.known[number] for number in at], values[at], covariance[np.ix_(at, at)]
+        )
+        return replace(self, vector=vector, information=information, unbalance=None)
 
     def _widened(self, added_covariance: FloatArray, common: FloatArray | None) -> "Stretch":
-        values, covariance = self.estimate()
-        wider = _stretch(
-            self.start_ns, self.end_ns, list(self.known), values, covariance + added_covariance, self.misfit_z
-        )
-        return replace(wider, common=common, unexplained=self.unexplained, unbalance=self.unbalance)
+        values, covariance = self.estimate
+        vector, information = _information(list(self.known), values, covariance + added_covariance)
+        return replace(self, vector=vector, information=information, common=common)
 
 
 def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
@@ -128,20 +124,23 @@ def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
     readings = diagnosis.evaluable
     known = [PARAMETERS.index(reading.name) for reading in readings]
     unbalance = diagnosis.unbalance if any(reading.name == "e" for reading in readings) else None
-    values = np.array(
-        [to_scale(reading.name, reading.relative_change or 0.0) for reading in readings], dtype=np.float64
-    )
-    slopes = np.array([slope(reading.name, value) for reading, value in zip(readings, values, strict=True)])
+    values, slopes = _scaled(readings)
     scale = np.outer(slopes, slopes)
-    covariance = diagnosis.full_covariance / scale
-    if diagnosis.common is None:
-        own = _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
-        return replace(own, unexplained=diagnosis.unexplained, unbalance=unbalance)
-    shared = diagnosis.common / scale
-    own = _stretch(start_ns, end_ns, known, values, _at_least(covariance - shared, covariance), diagnosis.misfit_z)
-    common = np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    common[np.ix_(known, known)] = shared
-    return replace(own, common=common, unexplained=diagnosis.unexplained, unbalance=unbalance)
+    own, common = diagnosis.full_covariance / scale, None
+    if diagnosis.common is not None:
+        shared = diagnosis.common / scale
+        own = _at_least(own - shared, own)
+        common = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+        common[np.ix_(known, known)] = shared
+    vector, information = _information(known, values, own)
+    return Stretch(start_ns, end_ns, vector, information, diagnosis.misfit_z, common, diagnosis.unexplained, unbalance)
+
+
+def _scaled(readings: Sequence[Parameter]) -> tuple[FloatArray, FloatArray]:
+    """Values of readings in the scale of their errors, and their `slope` there."""
+    values = [to_scale(reading.name, reading.relative_change or 0.0) for reading in readings]
+    slopes = [slope(reading.name, value) for reading, value in zip(readings, values, strict=True)]
+    return np.array(values, dtype=np.float64), np.array(slopes, dtype=np.float64)
 
 
 def _at_least(own: FloatArray, total: FloatArray) -> FloatArray:
@@ -151,9 +150,8 @@ def _at_least(own: FloatArray, total: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, _LEAST_OWN)) @ vectors.T / np.outer(scale, scale), dtype=np.float64)
 
 
-def _stretch(
-    start_ns: int, end_ns: int, known: list[int], values: FloatArray, covariance: FloatArray, misfit_z: float | None
-) -> Stretch:
+def _information(known: list[int], values: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`Stretch.vector` and `Stretch.information` from the values of some parameters and their covariance."""
     n = len(PARAMETERS)
     information, vector = np.zeros((n, n)), np.zeros(n)
     if known:
@@ -161,7 +159,7 @@ def _stretch(
         own = (own + own.T) / 2
         information[np.ix_(known, known)] = own
         vector[known] = own @ values
-    return Stretch(start_ns, end_ns, vector, information, misfit_z)
+    return vector, information
 
 
 def added(stretches: Sequence[Stretch]) -> Stretch:
@@ -209,26 +207,19 @@ def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis
     """
     readings = diagnosis.evaluable
     at = [PARAMETERS.index(reading.name) for reading in readings]
-    slopes = np.array([slope(r.name, to_scale(r.name, r.relative_change or 0.0)) for r in readings])
+    slopes = _scaled(readings)[1]
     shared = covariance[np.ix_(at, at)] * np.outer(slopes, slopes)
     total = diagnosis.full_covariance + shared
-    errors = dict(zip((reading.name for reading in readings), np.sqrt(np.diag(total)).tolist(), strict=True))
-    own = {reading.name: reading.standard_error or 0.0 for reading in readings}
-    unbalance = diagnosis.unbalance
-    if unbalance is not None and "e" in own:
-        unbalance = unbalance.widened(errors["e"] ** 2 - own["e"] ** 2)
-    wider = replace(diagnosis, covariance=total, common=shared, unbalance=unbalance)
-    parameters = tuple(
-        parameter_reading(one.name, one.by, one.relative_change, errors[one.name], _vector(wider, one.name))
-        if one.relative_change is not None
-        else one
-        for one in diagnosis.parameters
-    )
-    return replace(wider, parameters=parameters)
-
-
-def _vector(diagnosis: Diagnosis, name: str) -> UnbalanceVector | None:
-    return diagnosis.unbalance if name == "e" else None
+    unbalance, parameters, errors = diagnosis.unbalance, [], iter(np.sqrt(np.diag(total)).tolist())
+    for one in diagnosis.parameters:
+        if one.relative_change is None:
+            parameters.append(one)
+            continue
+        error, vector = next(errors), None
+        if one.name == "e" and unbalance is not None:
+            vector = unbalance = unbalance.widened(error**2 - (one.standard_error or 0.0) ** 2)
+        parameters.append(parameter_reading(one.name, one.by, one.relative_change, error, vector))
+    return replace(diagnosis, covariance=total, common=shared, unbalance=unbalance, parameters=tuple(parameters))
 
 
 def _stated(
@@ -246,8 +237,6 @@ def _stated(
         return reading
     error = math.nan if reading.standard_error is None else reading.standard_error
     if not error < vague:
-        text, limit = beyond(100 * error, 100 * vague)
-        return no_reading(
-            name, by, f"not determined in this window (standard error {text} %, limit for a reading {limit} %)"
-        )
-    return possible_reading(name, by, reading.relative_change, error, _vector(diagnosis, name))
+        return no_reading(name, by, not_determined(error, vague))
+    vector = diagnosis.unbalance if name == "e" else None
+    return possible_reading(name, by, reading.relative_change, error, vector)

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from benchmarks.finite_elements.rotor import changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
-from models.diagnosis.baseline.learned import Baseline, disagreements, learn_baseline, learned_rows, undetermined
-from models.diagnosis.baseline.rows import ROWS
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.learned import disagreements, learn_baseline, undetermined
+from models.diagnosis.baseline.rows import ROWS, learned_rows
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.errors import EstimationError
 from models.mistakes import mistakes
@@ -64,12 +64,12 @@ def test_an_unphysical_relation_is_not_determined() -> None:
     assert first is not None
     heavy_bearing = first.coefficients.copy()
     heavy_bearing[2] = 3 * heavy_bearing[1]
-    doubtful = replace(baseline(), relations=(replace(first, coefficients=heavy_bearing), second))
+    doubtful = baseline().model_copy(update={"relations": (replace(first, coefficients=heavy_bearing), second)})
     reason, none = undetermined(doubtful)
     assert "3.0 times the disc" in reason
     assert "record a second condition" in reason
     assert none == ""
-    vague = replace(doubtful, relations=(replace(first, covariance=first.covariance * 400), second))
+    vague = baseline().model_copy(update={"relations": (replace(first, covariance=first.covariance * 400), second)})
     assert "damping, horizontal is known to" in undetermined(vague)[0]
 
 
@@ -79,9 +79,9 @@ def test_one_condition_must_be_given_per_window() -> None:
 
 
 def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
-    text = BaselineRecord.of(baseline()).model_dump_json()
-    again = BaselineRecord.model_validate_json(text).baseline()
-    assert BaselineRecord.of(again).model_dump_json() == text
+    text = baseline().model_dump_json()
+    again = Baseline.model_validate_json(text)
+    assert again.model_dump_json() == text
     (window,) = recorded(changed_rotor(ROTOR, {"c_by": -0.3}), OTHER, 87, 1)
     one, other = (BaselineDiagnostician(each).diagnose(window) for each in (baseline(), again))
     assert (one.parameters, one.misfit_z) == (other.parameters, other.misfit_z)
@@ -102,15 +102,15 @@ def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
     ],
 )
 def test_a_damaged_baseline_is_refused(path: str, value: object, told: str) -> None:
-    record = json.loads(BaselineRecord.of(baseline()).model_dump_json())
+    record = json.loads(baseline().model_dump_json())
     *outer, last = (int(part) if part.isdecimal() else part for part in path.split("/"))
     place = reduce(getitem, outer, record)
     place[last] = value
     if value is None:
         del place[last]
     with pytest.raises(ValidationError) as refused:
-        BaselineRecord.model_validate_json(json.dumps(record))
-    assert [text for _, text in mistakes(refused.value, BaselineRecord)] == [told]
+        Baseline.model_validate_json(json.dumps(record))
+    assert [text for _, text in mistakes(refused.value, Baseline)] == [told]
 
 
 def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str:

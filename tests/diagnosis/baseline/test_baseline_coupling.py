@@ -9,9 +9,9 @@ import pytest
 from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import Baseline, planes_coupled, undetermined
+from models.diagnosis.baseline.learned import planes_coupled, undetermined
 from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
@@ -37,7 +37,7 @@ def later(name: str, changes: dict[str, float], number: int) -> WindowStatistics
 @pytest.mark.slow
 def test_plane_coupling_of_an_oil_film_is_learned_and_changes_are_named() -> None:
     learned = baseline("fluid-film")
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(learned).model_dump_json()).baseline()
+    again = Baseline.model_validate_json(learned.model_dump_json())
     assert learned.rows == again.rows == COUPLED_ROWS
     assert learned.force.size
     assert np.array_equal(again.force, learned.force)
@@ -57,7 +57,10 @@ def test_agreement_of_several_conditions_lowers_the_error_in_others() -> None:
     assert not planes_coupled(healthy("overhung"))
     assert learned.rows == ROWS
     half = tuple(replace(one, condition=str(one.window % 2)) for one in learned.consistency)
-    found = [BaselineDiagnostician(each).diagnose(window) for each in (learned, replace(learned, consistency=half))]
+    found = [
+        BaselineDiagnostician(each).diagnose(window)
+        for each in (learned, learned.model_copy(update={"consistency": half}))
+    ]
     assert found[0].unexplained == ""  # although the force is another one
     for name, floor in (("k_by", 0.005), ("c_by", 0.03)):
         alone, two = (next(each.standard_error for each in one.evaluable if each.name == name) for one in found)
@@ -70,7 +73,7 @@ def test_agreement_of_several_conditions_lowers_the_error_in_others() -> None:
 
 def test_a_relation_with_a_large_remainder_is_undetermined() -> None:
     first, second = baseline("overhung").relations
-    foreign = replace(baseline("overhung"), relations=(replace(sure(first), misfit=5.5), second))
+    foreign = baseline("overhung").model_copy(update={"relations": (replace(sure(first), misfit=5.5), second)})
     reason, none = undetermined(foreign)
     assert "the remainder is 5.5 times what chance leaves" in reason
     assert none == ""
@@ -82,7 +85,9 @@ def test_a_plane_left_undetermined_is_believed_in_the_other_only_with_two_condit
     first, second = baseline("overhung").relations
     heavy_bearing = sure(first).coefficients.copy()
     heavy_bearing[2] = 3 * heavy_bearing[1]
-    doubtful = replace(baseline("overhung"), relations=(replace(sure(first), coefficients=heavy_bearing), second))
+    doubtful = baseline("overhung").model_copy(
+        update={"relations": (replace(sure(first), coefficients=heavy_bearing), second)}
+    )
     monkeypatch.setattr("models.commissioning.levels.learn_baseline", lambda *_: doubtful)
     with pytest.raises(EstimationError, match="horizontal: what moves with the bearing comes out at"):
         learned_baseline(healthy("overhung"), ["one"] * 4)

@@ -12,10 +12,10 @@ from benchmarks.finite_elements.observed import RunCondition
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline import relation
+from models.diagnosis.baseline.conditions import alike
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.force import alike
-from models.diagnosis.baseline.learned import Baseline, learn_baseline
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -73,11 +73,11 @@ def test_only_one_condition_has_a_force_and_records_without_one_omit_it() -> Non
     both = [*windows(condition(3), 2, 1), *windows(condition(4), 2, 2)]
     assert baseline(3).force.shape == (18, 2, 2)
     assert learn_baseline(both, ["one", "one", "two", "two"]).force.size == 0
-    record = BaselineRecord.of(baseline(3).without_force).model_dump(mode="json")
+    record = baseline(3).without_force.model_dump(mode="json")
     assert "force" not in record
-    assert BaselineRecord.model_validate_json(json.dumps(record | {"force": []})).force.shape == (0, 0, 0)
+    assert Baseline.model_validate_json(json.dumps(record | {"force": []})).force.shape == (0, 0, 0)
     assert all("lag_from_s" not in relation for relation in record["relations"])
-    assert BaselineRecord.of(baseline(3)).model_dump(mode="json")["force"]
+    assert baseline(3).model_dump(mode="json")["force"]
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_relations_that_do_not_fit_use_longer_lags(monkeypatch: pytest.MonkeyPat
         if one.lag_from_s:
             assert one.misfit < other.misfit
     assert any(one is not None and one.lag_from_s for one in longer.relations)
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(longer).model_dump_json()).baseline()
+    again = Baseline.model_validate_json(longer.model_dump_json())
     lags = [None if one is None else one.lag_from_s for one in longer.relations]
     assert [None if one is None else one.lag_from_s for one in again.relations] == lags
 

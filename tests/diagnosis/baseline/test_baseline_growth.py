@@ -10,11 +10,11 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline.conditions import Growth
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.growth import Growth
-from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.baseline.rows import COUPLED_ROWS
-from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -85,9 +85,8 @@ def with_a_force_that_hides_a_plane() -> tuple[Baseline, tuple[WindowStatistics,
 def test_parameters_that_a_window_does_not_determine_make_no_sensor_suspect() -> None:
     learned, later_windows = with_a_force_that_hides_a_plane()
     # A growth as an earlier version may have stored it makes no sensor suspect either.
-    grown = replace(
-        learned, growth=tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
-    )
+    steep = tuple(one and replace(one, slope=9.0, standard_error=1.0) for one in learned.growth)
+    grown = learned.model_copy(update={"growth": steep})
     for baseline_ in (learned, grown):
         monitor = BaselineDiagnostician(baseline_)
         for window in later_windows:
@@ -106,13 +105,13 @@ def test_parameters_that_a_window_does_not_determine_make_no_sensor_suspect() ->
 def test_growth_widens_the_stiffness_of_another_motion_and_survives_its_record() -> None:
     learned, (window, *_) = with_a_force_that_hides_a_plane()
     vertical = sure(learned.growth[1])
-    grown = replace(learned, growth=(None, replace(vertical, slope=0.2, standard_error=0.01, power=vertical.power / 4)))
-    again = BaselineRecord.model_validate_json(BaselineRecord.of(grown).model_dump_json())
-    assert again.baseline().growth == grown.growth
-    older = BaselineRecord.of(replace(learned, growth=()))  # as before growth was recorded
-    assert "growth" not in older.model_dump(mode="json")
-    assert older.baseline().growth == ()
-    found = [one.diagnostician().diagnose(window) for one in (again, older)]
+    growth = (None, replace(vertical, slope=0.2, standard_error=0.01, power=vertical.power / 4))
+    grown, older = (learned.model_copy(update={"growth": each}) for each in (growth, ()))
+    again = Baseline.model_validate_json(grown.model_dump_json())
+    assert again.growth == grown.growth
+    assert "growth" not in older.model_dump(mode="json")  # as before growth was recorded
+    assert older.growth == ()
+    found = [BaselineDiagnostician(one).diagnose(window) for one in (again, older)]
     assert found[0].parameters == BaselineDiagnostician(grown).diagnose(window).parameters
     now, before = (next(one for one in each.evaluable if one.name == "k_bz") for each in found)
     assert now.relative_change == before.relative_change

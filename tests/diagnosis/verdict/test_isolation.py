@@ -161,12 +161,12 @@ def test_stretches_add_by_inverse_variance() -> None:
     cov = covariance(rng)
     parts = [stretch_of(window(rng.multivariate_normal(np.zeros(6), cov), cov, 1.5), n, n + 1) for n in range(4)]
     together = added(parts)
-    mean, spread = together.estimate()
+    mean, spread = together.estimate
     np.testing.assert_allclose(spread, cov / 4, rtol=1e-6)
-    np.testing.assert_allclose(mean, np.mean([part.estimate()[0] for part in parts], axis=0), atol=1e-9)
+    np.testing.assert_allclose(mean, np.mean([part.estimate[0] for part in parts], axis=0), atol=1e-9)
     assert together.misfit_z == pytest.approx(3.0)
     assert (together.start_ns, together.end_ns) == (0, 4)
-    np.testing.assert_allclose(together.blurred(0.01).estimate()[1], cov / 4 + 1e-4 * np.eye(6), rtol=1e-6)
+    np.testing.assert_allclose(together.blurred(0.01).estimate[1], cov / 4 + 1e-4 * np.eye(6), rtol=1e-6)
 
 
 def diagnosis(by: str, **changes: tuple[float, float]) -> Diagnosis:
