@@ -170,16 +170,15 @@ def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) 
 def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFault]:
     """Channels whose mean steps or drifts within the window, or differs from that in the reference."""
     means = window.hop_waveform.mean[:, : len(window.states)]
-    rms, spread = _scale(window), _spread(window)
+    # The median over the hops, so that a step within one does not raise the limit.
+    rms, spread = np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), _spread(window)
     steps, drifts = _largest_step(means), means[-1] - means[0]
-    moved = np.full(len(window.states), np.nan)
-    floor = np.zeros(len(window.states))
-    if reference is not None:
-        for column, state in enumerate(window.states):
-            known = reference.channel(state)
-            if known is not None:
-                moved[column] = means[:, column].mean() - known.mean
-                floor[column] = max(STEP_SPREADS * max(known.mean_spread, spread[column]), MOVED_PART * known.rms)
+    moved, floor = np.full(len(window.states), np.nan), np.zeros(len(window.states))
+    for column, state in enumerate(window.states):
+        known = None if reference is None else reference.channel(state)
+        if known is not None:
+            moved[column] = means[:, column].mean() - known.mean
+            floor[column] = max(STEP_SPREADS * max(known.mean_spread, spread[column]), MOVED_PART * known.rms)
     findings = []
     for column, state in enumerate(window.states):
         name, own = naming.name(state), float(rms[column])
@@ -218,17 +217,10 @@ CHECKS = (offset, spiked)
 """Checks of channels that are neither missing, stuck nor clipped, in their order."""
 
 
-def _scale(window: WindowStatistics) -> FloatArray:
-    """Median over the hops of each channel's rms, so that a step within one hop does not raise the limit."""
-    return np.asarray(np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), dtype=np.float64)
-
-
 def _spread(window: WindowStatistics) -> FloatArray:
     """Robust standard deviation of a hop's mean from hop to hop, at least that which the lowest bins predict."""
-    hops = window.hop_waveform
-    n, count = len(window.states), len(window.waveforms)
-    means = hops.mean[:, :n]
-    between = np.zeros(n)
+    means, count = window.hop_waveform.mean[:, : len(window.states)], len(window.waveforms)
+    between = np.zeros(len(window.states))
     if count > 3:
         steps = np.diff(means, axis=0)
         between = 1.4826 * np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) / np.sqrt(2)
@@ -247,12 +239,9 @@ def _largest_step(means: FloatArray) -> FloatArray:
 
 def _shaft_moved(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     """Whether a displacement's mean changed together with another displacement's, as when the shaft moves."""
-    places = [
-        i for i, name in enumerate(states) if name in ("y1", "y2", "z1", "z2") or re.fullmatch(r"\w+@[\d.]+", name)
-    ]
-    if column not in places:
-        return False
-    return any(abs(changes[i]) > _SHAFT_PART * abs(changes[column]) for i in places if i != column)
+    places = [at for at, name in enumerate(states) if re.fullmatch(r"[yz][12]|\w+@[\d.]+", name)]
+    others = [at for at in places if at != column] if column in places else []
+    return any(abs(changes[at]) > _SHAFT_PART * abs(changes[column]) for at in others)
 
 
 MOST_ERRORS = 6.0  # standard errors that a jump must exceed, tested at the most probable of all moments

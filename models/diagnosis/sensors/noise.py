@@ -6,24 +6,13 @@ and of its share of the vibration, less the median rise of the other channels. T
 matter: the diagnosis allows for noise, and a finding would stop it needlessly.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence, Set
 
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading
-from models.diagnosis.sensors.reference import (
-    ChannelNoise,
-    Naming,
-    SensorReference,
-    channel_noise,
-    channel_rms,
-    floor,
-    matched,
-    pair_noise,
-    single,
-)
-from models.diagnosis.window.motion import MotionPair
+from models.diagnosis.sensors.kinematics import PairReading
+from models.diagnosis.sensors.reference import Naming, SensorReference, channel_noise, channel_rms, floor, pair_noise
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
@@ -69,39 +58,32 @@ def _alone(rise: FloatArray) -> FloatArray:
 def noisy(
     window: WindowStatistics,
     readings: Sequence[PairReading],
-    bands: Mapping[MotionPair, Banded],
     naming: Naming,
     reference: SensorReference | None,
-    sound: Callable[..., bool],
+    bad: Set[str],
 ) -> list[SensorFault]:
     """Findings on channels with more noise than on the healthy machine; none without a reference.
 
-    The readings are those of pairs that see the same motion; `sound` returns whether columns have no other fault.
+    The readings are those of pairs that see the same motion; `bad` are states with other faults.
     """
     if reference is None:
         return []
-    findings = _of_pairs(
-        window, [one for one in readings if sound(one.pair.first, one.pair.second)], bands, naming, reference
-    )
-    columns = single(window.states)
-    if not findings and sound(*range(len(window.states))):
-        findings += _of_single(window, channel_noise(window, columns), naming, reference)
-    return findings
+    sound = [one for one in readings if one.first not in bad and one.second not in bad]
+    findings = _of_pairs(window, sound, naming, reference)
+    if findings or not bad.isdisjoint(window.states):
+        return findings
+    return _of_single(window, naming, reference)
 
 
 def _of_pairs(
-    window: WindowStatistics,
-    readings: Sequence[PairReading],
-    bands: Mapping[MotionPair, Banded],
-    naming: Naming,
-    reference: SensorReference,
+    window: WindowStatistics, readings: Sequence[PairReading], naming: Naming, reference: SensorReference
 ) -> list[SensorFault]:
     known = []
     for reading in readings:
-        then = reference.pair(window.states[reading.pair.first], window.states[reading.pair.second])
+        then = reference.pair(reading.first, reading.second)
         healthy = None if then is None else then.noise
-        if healthy is not None and len(healthy.density) == bands[reading.pair].w.size:
-            known.append((reading, pair_noise(window, bands[reading.pair], reading), healthy))
+        if healthy is not None and len(healthy.density) == reading.bands.w.size:
+            known.append((reading, pair_noise(window, reading), healthy))
     if not known:
         return []
     absolute = np.log([now.density / (np.array(then.density) + now.leakage) for _, now, then in known])
@@ -113,8 +95,8 @@ def _of_pairs(
         risen = rise[row] > limit
         if not np.any(risen):
             continue
-        pair, own = reading.pair, bands[reading.pair]
-        guilty = _guilty(own, reading, risen)
+        pair, own = reading.pair, reading.bands
+        guilty = _guilty(reading, risen)
         width_hz = (window.frequencies_hz[-1] - window.frequencies_hz[0]) / own.w.size
         excess = 2 * width_hz * now.density * -np.expm1(-rise[row]) * (rise[row] > np.log(_COUNTS))
         # rms of the noise if all of it came from the first sensor, in the first sensor's quantity
@@ -141,9 +123,13 @@ def _of_pairs(
     return findings
 
 
-def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
+def _guilty(reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
     """Column of the noisy one of two sensors, from powers that the other places do not explain; None if unclear."""
-    spectra = matched(bands, reading)[risen]
+    bands, h = reading.bands, reading.transfer
+    spectra = bands.spectra.copy()
+    spectra[:, 0] *= h[:, None]  # corrected to the gain, polarity and delay of the second
+    spectra[:, :, 0] *= h.conj()[:, None]
+    spectra = spectra[risen]
     power, n = np.maximum(np.einsum("bii->bi", spectra).real, np.finfo(float).tiny), spectra.shape[1]
     own = spectra[:, :2, :2]
     if n > 2:
@@ -185,11 +171,9 @@ def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
     return abs(line_hz - round(line_hz / shaft_hz) * shaft_hz) > resolution_hz
 
 
-def _of_single(
-    window: WindowStatistics, noises: Sequence[ChannelNoise], naming: Naming, reference: SensorReference
-) -> list[SensorFault]:
+def _of_single(window: WindowStatistics, naming: Naming, reference: SensorReference) -> list[SensorFault]:
     known = []
-    for now in noises:
+    for now in channel_noise(window):
         channel = reference.channel(window.states[now.column])
         healthy = None if channel is None else channel.noise
         if healthy is not None and len(healthy.density) == now.density.size:

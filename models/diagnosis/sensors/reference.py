@@ -6,14 +6,14 @@ The motion shows the machine's resonances, the noise is the floor below them. A 
 hum (`noise.is_hum`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
+from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair, same
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.motion import motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
@@ -34,8 +34,8 @@ class Naming:
     A state that none of the machine's channels measures is called by its own name, with values in SI units.
     """
 
-    def __init__(self, channels: Iterable[Channel] = ()) -> None:
-        self._channels: Mapping[str, Channel] = {state_name(channel): channel for channel in channels}
+    def __init__(self, channels: Iterable[Channel]) -> None:
+        self._channels = {state_name(channel): channel for channel in channels}
 
     def name(self, state: str) -> str:
         """Name of the channel."""
@@ -106,24 +106,9 @@ def channel_rms(window: WindowStatistics) -> FloatArray:
     return np.asarray(np.sqrt((rms**2).mean(axis=0)), dtype=np.float64)
 
 
-def single(states: tuple[str, ...]) -> list[int]:
-    """Columns of motions that only one sensor measures."""
-    paired = {column for pair in motion_pairs(states) for column in (pair.first, pair.second)}
-    return [column for column in range(len(states)) if column not in paired]
-
-
-def matched(bands: Banded, reading: PairReading) -> ComplexArray:
-    """Banded spectra with the first sensor corrected to the gain, polarity and delay of the second."""
-    h = reading.transfer(bands.w)
-    spectra = bands.spectra.copy()
-    spectra[:, 0] *= h[:, None]
-    spectra[:, :, 0] *= h.conj()[:, None]
-    return spectra
-
-
-def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) -> PairNoise:
+def pair_noise(window: WindowStatistics, reading: PairReading) -> PairNoise:
     """Power of the difference of two sensors of one motion."""
-    h = reading.transfer(bands.w)
+    bands, h = reading.bands, reading.transfer
     z, v, cross = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real, bands.spectra[:, 1, 0]
     power = np.abs(h) ** 2 * z + v
     density = np.maximum(power - 2 * (cross * h.conj()).real, 1e-12 * power)
@@ -136,9 +121,11 @@ def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) ->
     return PairNoise(np.asarray(density, dtype=np.float64), np.asarray(leakage, dtype=np.float64), scale)
 
 
-def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[ChannelNoise]:
-    """Power of the given columns that the other channels do not explain; empty if there are too few data."""
+def channel_noise(window: WindowStatistics) -> list[ChannelNoise]:
+    """Power of channels without a second sensor that the others do not explain; empty if there are too few data."""
     rms = channel_rms(window)
+    paired = {column for pair in motion_pairs(window.states) for column in (pair.first, pair.second)}
+    columns = [column for column in range(len(window.states)) if column not in paired]
     n_bins, n = window.frequencies_hz.size, len(window.states)
     if not columns or n < 2 or window.n_segments < 2 * n or not np.all(rms > 0):
         return []
@@ -280,6 +267,12 @@ class SensorReference(BaseModel, extra="forbid", frozen=True, strict=True, allow
         return next((pair for pair in self.pairs if (pair.first, pair.second) == (first, second)), None)
 
 
+PERFECT = PairReference(
+    first="", second="", log_gain=0, log_gain_spread=0, polarity=1, delay_s=0, delay_spread_s=0, shared=1, same=1
+)
+"""What is expected of two sensors without a reference."""
+
+
 def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReference:
     """Learn the sensors' reference from healthy windows that do not overlap.
 
@@ -292,11 +285,8 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         raise EstimationError("no healthy window to learn the sensors from")
     windows = [window.as_mounted for window in windows]
     states = windows[0].states
-    for window in windows:
-        if window.states != states:
-            raise EstimationError(
-                f"healthy windows hold different channels: {', '.join(states)} and {', '.join(window.states)}"
-            )
+    if other := next((window.states for window in windows if window.states != states), None):
+        raise EstimationError(f"healthy windows hold different channels: {', '.join(states)} and {', '.join(other)}")
     pairs = []
     for pair in motion_pairs(states):
         bands = [banded(window, pair) for window in windows]
@@ -308,9 +298,9 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         if any(one.lead_rad_s for one in there):
             again = [read_pair(window, pair, own, lead_rad_s) for window, own in zip(windows, bands, strict=True)]
             there = [one for one in again if one is not None]
-        noises = [pair_noise(window, own, one) for window, own, one in zip(windows, bands, there, strict=True)]
-        pairs.append(_pair(states, there, min(same(own) for own in bands), _noise(noises)))
-    alone = [channel_noise(window, single(states)) for window in windows]
+        noises = [pair_noise(window, one) for window, one in zip(windows, there, strict=True)]
+        pairs.append(_pair(there, _noise(noises)))
+    alone = [channel_noise(window) for window in windows]
     noise = {each[0].column: _noise(each) for each in zip(*alone, strict=False)}
     speeds = np.concatenate([window.hop_speed_rad_s for window in windows])
     return SensorReference(
@@ -335,7 +325,7 @@ def _noise(noises: Sequence[PairNoise | ChannelNoise]) -> NoiseReference | None:
     )
 
 
-def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseReference | None = None) -> ChannelReference:
+def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseReference | None) -> ChannelReference:
     means = np.concatenate([window.hop_waveform.mean[:, column] for window in windows])
     squares = np.concatenate([window.hop_waveform.rms[:, column] ** 2 for window in windows])
     rotation = rotation_spread = None
@@ -356,16 +346,13 @@ def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseRefer
     )
 
 
-def _pair(
-    states: tuple[str, ...], readings: list[PairReading], least_same: float, noise: NoiseReference | None
-) -> PairReference:
+def _pair(readings: list[PairReading], noise: NoiseReference | None) -> PairReference:
     """Mean of the windows' readings; the spread combines their scatter beyond their own errors and the mean's error."""
     figures = [(one.log_gain, one.log_gain_error, one.delay_s, one.delay_error_s) for one in readings]
     gains, gain_errors, delays, delay_errors = np.array(figures).T.copy()
-    pair = readings[0].pair
     return PairReference(
-        first=states[pair.first],
-        second=states[pair.second],
+        first=readings[0].first,
+        second=readings[0].second,
         log_gain=float(gains.mean()),
         log_gain_spread=_spread(gains, gain_errors),
         polarity=1 if sum(reading.polarity for reading in readings) >= 0 else -1,
@@ -373,13 +360,12 @@ def _pair(
         delay_spread_s=_spread(delays, delay_errors),
         lead_rad_s=readings[0].lead_rad_s,
         shared=min(reading.shared for reading in readings),
-        same=least_same,
+        same=min(same(reading.bands) for reading in readings),
         noise=noise,
     )
 
 
 def _spread(values: FloatArray, errors: FloatArray) -> float:
-    own = float(np.mean(errors**2))
-    n = len(values)
+    own, n = float(np.mean(errors**2)), len(values)
     scatter = float(values.var(ddof=1)) if n > 1 else own
     return float(np.sqrt(max(scatter - own, 0.0) + max(scatter, own) / n))

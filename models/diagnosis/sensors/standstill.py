@@ -88,11 +88,5 @@ class Standstill:
         return {"running": self._running}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Restore the state that `checkpoint` returned.
-
-        Raises
-        ------
-        CheckpointError
-            If the array is missing, or has another type or shape.
-        """
+        """Restore the state that `checkpoint` returned."""
         self._running = checked(arrays, "running", np.float64, (None,))
