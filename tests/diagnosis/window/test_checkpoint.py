@@ -18,8 +18,7 @@ from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window.moments import plan_for
-from models.diagnosis.window.recall import digest_of
-from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.sliding import SlidingWindow, digest_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError
 from models.ingest import Admission, Gate, Reason
