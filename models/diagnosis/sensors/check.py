@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, swapped
-from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
+from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair
 from models.diagnosis.sensors.level import CHECKS, clipped, dropped, gain_jump, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
@@ -37,17 +37,19 @@ def sensor_findings(
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
-    bare = implicated(missing)
-    still = [*stuck(window, naming, stood), *dropped(window, naming)]
-    findings = [*missing, *(found for found in still if not set(found.states) & bare)]
-    lost = implicated(findings)  # a channel that drops to the end of its range is not clipped
-    findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
-    wrong_angle = [] if "theta" in bare else no_angle(window, naming)
+    findings = list(missing)
+
+    def of_others(found: Iterable[SensorFault]) -> list[SensorFault]:
+        bad = implicated(findings)
+        return [one for one in found if bad.isdisjoint(one.states)]
+
+    findings += of_others((*stuck(window, naming, stood), *dropped(window, naming)))
+    findings += of_others(clipped(window, naming))  # a channel that drops to the end of its range is not clipped
+    wrong_angle = [] if "theta" in implicated(missing) else no_angle(window, naming)
     if stood.any() or wrong_angle:
         return (*findings, *wrong_angle)
     for check in CHECKS:
-        bad = implicated(findings)
-        findings += [found for found in check(window, naming, reference) if not set(found.states) & bad]
+        findings += of_others(check(window, naming, reference))
     bad = implicated(findings)
     if any("theta" in one.states and (one.value or 0.0) < _ALL * window.duration_s for one in missing):
         return tuple(findings)  # a hop in which the angle comes or goes keeps its synchronous part
@@ -57,7 +59,7 @@ def sensor_findings(
         if wrong_angle:
             return (*findings, *wrong_angle)
     pairs = [pair for pair in motion_pairs(window.states) if {pair.first, pair.second} <= set(columns)]
-    bands = {pair: banded(window, pair) for pair in pairs}
+    bands = {pair: Banded(window, pair) for pair in pairs}
     exchanged, explained = swapped(window, bands, naming, reference)
     findings += exchanged
     readings: list[PairReading] = []
@@ -76,9 +78,8 @@ def sensor_findings(
                 f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
             )
             findings.append(SensorFault(states=states, kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
-    bad = implicated(findings)
     findings += gain_and_delay(window, readings, naming, reference)
-    findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
+    findings += of_others(gain_jump(window, naming))  # of channels that are in no reading
     bad = implicated(findings)
     if "theta" not in bad:  # the synchronous part that a wrong angle leaves in the spectra looks like noise
         findings += noisy(window, readings, naming, reference, bad)

@@ -1,12 +1,11 @@
 """Two sensors of one motion that disagree: wrong gain or delay of one of them, or swapped channels."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, delay_course, gain_courses, same
+from models.diagnosis.sensors.kinematics import Banded, PairReading, delay_course, gain_courses, same
 from models.diagnosis.sensors.reference import PERFECT, Naming, SensorReference
 from models.diagnosis.window.motion import MotionPair, motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
@@ -30,27 +29,29 @@ _LEAST_COHERENCE = 0.5  # coherence of bearing and disc across the planes, and h
 _MOST_ERROR = 0.2  # largest standard error of a channel's own change, as part of the disagreement, to name a sensor
 
 
-@dataclass(frozen=True, slots=True)
 class _Departure:
     """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
-    reading: PairReading
-    log_gain: float
-    gain_z: float
-    delay_s: float
-    delay_z: float
-    course: FloatArray
-    course_step: float
-    course_z: float
-    known: bool
-    reversed: bool
+    def __init__(self, window: WindowStatistics, reading: PairReading, reference: SensorReference | None) -> None:
+        known = None if reference is None else reference.pair(reading.first, reading.second)
+        usual = known or PERFECT
+        self.reading, self.known, self.reversed = reading, known is not None, reading.polarity != usual.polarity
+        self.log_gain, self.delay_s = reading.log_gain - usual.log_gain, reading.delay_s - usual.delay_s
+        self.gain_z = abs(self.log_gain) / float(np.hypot(reading.log_gain_error, usual.log_gain_spread))
+        self.delay_z = abs(self.delay_s) / float(np.hypot(reading.delay_error_s, usual.delay_spread_s))
+        courses = gain_courses(window, reading)
+        self.course = courses[0][0]
+        parts = [_largest_part(*one) for one in courses]
+        self.course_step, self.course_z = min(parts, key=lambda part: part[1])
+        if len({part[0] > 0 for part in parts}) > 1:
+            self.course_step, self.course_z = 0.0, 0.0  # the noise of one of the two has changed
 
 
 def gain_and_delay(
     window: WindowStatistics, readings: list[PairReading], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
     """Findings on pairs that see the same motion but differ in gain or delay."""
-    departures = {reading.pair: _departure(window, reading, reference) for reading in readings}
+    departures = {reading.pair: _Departure(window, reading, reference) for reading in readings}
     rate_hz = window.n_samples / window.duration_s
     findings: list[SensorFault] = []
     for departure in departures.values():
@@ -68,24 +69,10 @@ def gain_and_delay(
             findings.append(_lead(departure.reading, naming))
         elif late:
             findings.append(_delay(departure, departures, naming, rate_hz))
-    return _once(findings)
-
-
-def _departure(window: WindowStatistics, reading: PairReading, reference: SensorReference | None) -> _Departure:
-    known = None if reference is None else reference.pair(reading.first, reading.second)
-    usual = known or PERFECT
-    gain, delay = reading.log_gain - usual.log_gain, reading.delay_s - usual.delay_s
-    gain_error = float(np.hypot(reading.log_gain_error, usual.log_gain_spread))
-    delay_error = float(np.hypot(reading.delay_error_s, usual.delay_spread_s))
-    courses = gain_courses(window, reading)
-    parts = [_largest_part(*one) for one in courses]
-    step, z = min(parts, key=lambda part: part[1])
-    if len({part[0] > 0 for part in parts}) > 1:
-        step, z = 0.0, 0.0  # the noise of one of the two has changed
-    return _Departure(
-        reading, gain, abs(gain) / gain_error, delay, abs(delay) / delay_error, courses[0][0], step, z,
-        known is not None, reading.polarity != usual.polarity,
-    )  # fmt: skip
+    best: dict[tuple[tuple[str, ...], str], SensorFault] = {}  # the same of the same channels once, with its largest z
+    for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
+        best.setdefault((finding.states, finding.kind), finding)
+    return list(best.values())
 
 
 def _largest_part(course: FloatArray, error: FloatArray) -> tuple[float, float]:
@@ -165,9 +152,7 @@ def _delay(
 def _lead(reading: PairReading, naming: Naming) -> SensorFault:
     """Finding on a sensor that leads as behind a high-pass; its value is the lead in s, weighted with the power."""
     power, lead_rad_s = reading.bands.spectra[:, 1, 1].real, abs(reading.lead_rad_s)
-    state, other = reading.first, reading.second
-    if reading.lead_rad_s > 0:
-        state, other = other, state
+    state, other = (reading.second, reading.first) if reading.lead_rad_s > 0 else (reading.first, reading.second)
     text = (
         f"{naming.name(state)}: runs ahead of {naming.name(other)} as behind a first-order high-pass at "
         f"{lead_rad_s / (2 * np.pi):.2g} Hz (AC coupling), expected at most {MOST_LEAD_RAD_S / (2 * np.pi):.2g} Hz: "
@@ -245,14 +230,6 @@ def _explaining_channel(pair: MotionPair, changes: list[float], size: float) -> 
     return pair.first if abs(second) < most and abs(first + size) < most else None
 
 
-def _once(findings: list[SensorFault]) -> list[SensorFault]:
-    """Each fault of the same channels once, as found with the largest z."""
-    best: dict[tuple[tuple[str, ...], str], SensorFault] = {}
-    for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
-        best.setdefault((finding.states, finding.kind), finding)
-    return list(best.values())
-
-
 BROKEN = 0.9  # two sensors of one motion that share less than this do not see the same motion
 _SUSPECT = 0.985  # below this, channels may be swapped: two places of a stiff shaft move much alike
 _RESTORED = 0.97  # least part that both pairs must share after the exchange, over the healthy part
@@ -281,7 +258,7 @@ def swapped(
             continue
         crossed = (MotionPair(one.first, other.second, one.order), MotionPair(other.first, one.second, one.order))
         now = min(same(bands[pair]) for pair in (one, other))
-        then = min(same(banded(window, pair)) for pair in crossed)
+        then = min(same(Banded(window, pair)) for pair in crossed)
         if then < _RESTORED * min(healthy(one), healthy(other)) or 1 - now < _LEAST_IMPROVEMENT * (1 - then):
             continue
         explained |= {one, other}
@@ -292,11 +269,9 @@ def swapped(
         pairs = " and ".join(
             f"{naming.name(window.states[p.first])} moves like {naming.name(window.states[p.second])}" for p in crossed
         )
-        either = (
-            f"{naming.names(states)} are swapped"
-            if guilty is not None
-            else f"{naming.names(states[:2])} are swapped, or {naming.names(states[2:])}"
-        )
+        either = f"{naming.names(states[:2])} are swapped"
+        if guilty is None:
+            either += f", or {naming.names(states[2:])}"
         text = f"{either}: {pairs}, but not as they are connected (shared {then:.3f} crossed, {now:.3f} as connected)"
         findings.append(SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=now))
     return findings, explained
@@ -353,7 +328,7 @@ def _exchanged_side(
 def _agrees(window: WindowStatistics, side: int, column: int) -> bool:
     """Whether a column still agrees with a third sensor of its motion, on the side away from the broken pair."""
     pairs = [pair for pair in motion_pairs(window.states) if column == (pair.first if side else pair.second)]
-    return any(same(banded(window, pair)) > _RESTORED for pair in pairs)
+    return any(same(Banded(window, pair)) > _RESTORED for pair in pairs)
 
 
 def _exchanged(window: WindowStatistics, sizes: FloatArray, side: tuple[int, int], reference: SensorReference) -> bool:

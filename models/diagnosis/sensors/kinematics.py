@@ -34,17 +34,42 @@ _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann s
 _FLOOR = 1e-10
 
 
-@dataclass(frozen=True, slots=True)
 class Banded:
     """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
 
-    # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
-    spectra: ComplexArray
-    total: ComplexArray  # (n_bands, 2, 2), the same for z and v, including the synchronous part
-    w: FloatArray  # (n_bands,), angular frequency at the centroid of each band's power
-    averages: FloatArray  # (n_bands,), number of effectively independent samples
-    # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without 1x vectors
-    rotation: tuple[float, ComplexArray] | None
+    def __init__(self, window: WindowStatistics, pair: MotionPair) -> None:
+        w = 2 * np.pi * window.frequencies_hz
+        columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
+        edges = pair_bands(w.size)
+        counts = np.diff(np.append(edges, w.size))
+        turn = (1j * w) ** pair.order
+        turned = window.spectrum[:, pair.first, columns] * turn[:, None]
+        turned[:, 0] *= turn.conj()
+        own = window.spectrum[:, pair.second, pair.second].real
+        power = own + _FLOOR * own.max() + np.finfo(float).tiny
+        # (n_bands,), angular frequency at the centroid of each band's power
+        self.w: FloatArray = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
+        step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+        # (n_bands,), number of effectively independent samples
+        self.averages: FloatArray = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
+        # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
+        self.spectra = window.banded_spectrum[:, columns[:, None], columns]
+        self.spectra[:, 0] = np.add.reduceat(turned, edges)
+        self.spectra[:, 1:, 0] = self.spectra[:, 0, 1:].conj()
+        self.spectra /= counts[:, None, None]
+        self.total = self.spectra[:, :2, :2].copy()  # (n_bands, 2, 2), including the synchronous part
+        # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without vectors
+        self.rotation: tuple[float, ComplexArray] | None = None
+        vectors, speeds = window.rotation_vectors, window.hop_speed_rad_s
+        if vectors is not None:
+            known = np.isfinite(speeds)
+            z = vectors[:, pair.first] * (1j * speeds) ** pair.order
+            both, speed = np.stack([z, vectors[:, pair.second]], axis=1)[known], float(np.mean(speeds[known]))
+            near = int(np.searchsorted(w[edges], speed, side="right")) - 1
+            if near >= 0 and speed <= w[-1]:
+                line = both.T @ both.conj() / len(both)
+                self.total[near] += line / (4 * counts[near] * step_hz)
+            self.rotation = speed, both
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,54 +99,10 @@ class PairReading:
         return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
 
 
-def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
-    """Average the window's spectra over bands, with the first channel differentiated to the second's quantity."""
-    w = 2 * np.pi * window.frequencies_hz
-    columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
-    edges = pair_bands(w.size)
-    counts = np.diff(np.append(edges, w.size))
-    turn = (1j * w) ** pair.order
-    turned = window.spectrum[:, pair.first, columns] * turn[:, None]
-    turned[:, 0] *= turn.conj()
-    own = window.spectrum[:, pair.second, pair.second].real
-    power = own + _FLOOR * own.max() + np.finfo(float).tiny
-    centre = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
-    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
-    averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
-    spectra = window.banded_spectrum[:, columns[:, None], columns]
-    spectra[:, 0] = np.add.reduceat(turned, edges)
-    spectra[:, 1:, 0] = spectra[:, 0, 1:].conj()
-    spectra /= counts[:, None, None]
-    total = spectra[:, :2, :2].copy()
-    rotation = _rotation(window, pair)
-    if rotation is not None:
-        speed, vectors = rotation
-        near = int(np.searchsorted(w[edges], speed, side="right")) - 1
-        if near >= 0 and speed <= w[-1]:
-            line = vectors.T @ vectors.conj() / len(vectors)
-            total[near] += line / (4 * counts[near] * step_hz)
-    return Banded(spectra, total, centre, averages, rotation)
-
-
-def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, ComplexArray] | None:
-    """Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2)."""
-    vectors = window.rotation_vectors
-    if vectors is None:
-        return None
-    W = window.hop_speed_rad_s
-    known = np.isfinite(W)
-    z = vectors[:, pair.first] * (1j * W) ** pair.order
-    both = np.stack([z, vectors[:, pair.second]], axis=1)[known]
-    return float(np.mean(W[known])), both
-
-
 def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
     """First column of each place other than the pair's."""
-    own = states[pair.first].partition("_")[0]
-    first: dict[str, int] = {}
-    for column, name in enumerate(states):
-        first.setdefault(name.partition("_")[0], column)
-    return [column for place, column in first.items() if place != own]
+    places = [name.partition("_")[0] for name in states]
+    return [places.index(place) for place in dict.fromkeys(places) if place != places[pair.first]]
 
 
 def same(bands: Banded) -> float:
@@ -153,7 +134,7 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 def read_pair(
     window: WindowStatistics, pair: MotionPair, bands: Banded, lead_rad_s: float | None = None
 ) -> PairReading | None:
-    """Compare two sensors of one motion, from their `banded` spectra; None if either does not fluctuate.
+    """Compare two sensors of one motion, from their banded spectra; None if either does not fluctuate.
 
     `lead_rad_s` is the lead of the healthy pair; if None, it is estimated from the window.
     """

@@ -6,13 +6,14 @@ and of its share of the vibration, less the median rise of the other channels. T
 matter: the diagnosis allows for noise, and a finding would stop it needlessly.
 """
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.sensors.kinematics import PairReading
-from models.diagnosis.sensors.reference import Naming, SensorReference, channel_noise, channel_rms, floor, pair_noise
+from models.diagnosis.sensors.reference import Naming, PairNoise, SensorReference, channel_noise, channel_rms, floor
+from models.diagnosis.window.excluded import MAINS_HZ
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
@@ -36,7 +37,6 @@ FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's ow
 LINE_RISE = 4.0
 # Least rms of the noise over that of the channel to be reported: as seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
-_MAINS_HZ = (50.0, 60.0)
 _MAINS_OFF_HZ = 0.2  # largest deviation of the mains frequency (EN 50160 allows 1 % in 99.5 % of a year)
 _FEWEST = 4  # least number of channels needed to see that one of them rose alone
 # Calibrated standard deviations of the logarithm of a healthy pair's rise, and of that of a healthy channel's floor.
@@ -69,28 +69,28 @@ def noisy(
     if reference is None:
         return []
     sound = [one for one in readings if one.first not in bad and one.second not in bad]
-    findings = _of_pairs(window, sound, naming, reference)
-    if findings or not bad.isdisjoint(window.states):
-        return findings
-    return _of_single(window, naming, reference)
+    findings = list(_of_pairs(window, sound, naming, reference))
+    if not findings and bad.isdisjoint(window.states):
+        findings += _of_single(window, naming, reference)
+    return findings
 
 
 def _of_pairs(
     window: WindowStatistics, readings: Sequence[PairReading], naming: Naming, reference: SensorReference
-) -> list[SensorFault]:
+) -> Iterator[SensorFault]:
     known = []
     for reading in readings:
         then = reference.pair(reading.first, reading.second)
         healthy = None if then is None else then.noise
         if healthy is not None and len(healthy.density) == reading.bands.w.size:
-            known.append((reading, pair_noise(window, reading), healthy))
+            known.append((reading, PairNoise(window, reading), healthy))
     if not known:
-        return []
+        return
     absolute = np.log([now.density / (np.array(then.density) + now.leakage) for _, now, then in known])
     relative = np.log([now.density / (np.array(then.share) * now.scale + now.leakage) for _, now, then in known])
     rise = np.minimum(_alone(absolute), _alone(relative))
     limit = np.log(PAIR_RISE if len(known) > 1 else ALONE_RISE)
-    rms, findings = channel_rms(window), []
+    rms = channel_rms(window)
     for row, (reading, now, _) in enumerate(known):
         risen = rise[row] > limit
         if not np.any(risen):
@@ -119,8 +119,7 @@ def _of_pairs(
             text += "; which of the two it is cannot be told"
         z = float(rise[row].max()) / float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
         value = sizes[column] / float(rms[column])
-        findings.append(SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z))
-    return findings
+        yield SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z)
 
 
 def _guilty(reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
@@ -159,11 +158,8 @@ def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
     >>> is_hum(100.1, 138.2, 0.5), is_hum(100.1, 2 * np.pi * 25.0, 0.5), is_hum(88.2, 138.2, 0.5)
     (True, False, False)
     """
-    for mains_hz in _MAINS_HZ:
-        harmonic = round(line_hz / mains_hz)
-        if harmonic and abs(line_hz - harmonic * mains_hz) <= harmonic * _MAINS_OFF_HZ + resolution_hz / 2:
-            break
-    else:
+    near = ((round(line_hz / mains_hz), mains_hz) for mains_hz in MAINS_HZ)
+    if not any(n and abs(line_hz - n * mains_hz) <= n * _MAINS_OFF_HZ + resolution_hz / 2 for n, mains_hz in near):
         return False
     shaft_hz = abs(speed_rad_s) / (2 * np.pi)
     if not np.isfinite(shaft_hz) or shaft_hz == 0:
@@ -171,7 +167,7 @@ def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
     return abs(line_hz - round(line_hz / shaft_hz) * shaft_hz) > resolution_hz
 
 
-def _of_single(window: WindowStatistics, naming: Naming, reference: SensorReference) -> list[SensorFault]:
+def _of_single(window: WindowStatistics, naming: Naming, reference: SensorReference) -> Iterator[SensorFault]:
     known = []
     for now in channel_noise(window):
         channel = reference.channel(window.states[now.column])
@@ -179,11 +175,11 @@ def _of_single(window: WindowStatistics, naming: Naming, reference: SensorRefere
         if healthy is not None and len(healthy.density) == now.density.size:
             known.append((now, healthy))
     if not known:
-        return []
+        return
     absolute = np.array([floor(np.log(now.density)) - floor(np.log(then.density)) for now, then in known])
     relative = np.array([floor(np.log(now.share)) - floor(np.log(then.share)) for now, then in known])
     rise, alone = np.minimum(absolute, relative), np.minimum(_alone(absolute), _alone(relative))
-    rms, findings = channel_rms(window), []
+    rms = channel_rms(window)
     band_hz = float(window.frequencies_hz[-1] - window.frequencies_hz[0])
     for row, (now, then) in enumerate(known):
         state, own = window.states[now.column], float(rms[now.column])
@@ -197,7 +193,7 @@ def _of_single(window: WindowStatistics, naming: Naming, reference: SensorRefere
                 f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=now.line_rms / own))
+            yield SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=now.line_rms / own)
         elif risen and now.flat > FLOOR_FLAT and size > LEAST_FLOOR * own:
             factor = float(np.exp(rise[row] / 2))
             text = (
@@ -206,5 +202,4 @@ def _of_single(window: WindowStatistics, naming: Naming, reference: SensorRefere
                 "cable, earthing or amplifier"
             )
             z = float(rise[row]) / _FLOOR_SCATTER
-            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=size / own, z=z))
-    return findings
+            yield SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=size / own, z=z)
