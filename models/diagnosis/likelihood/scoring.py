@@ -138,12 +138,8 @@ class FisherScoring:
 
         The search has converged when a full step would move no diagnosed parameter by more than `near` standard errors
         and would gain less than `gain` in log-likelihood. `hopeless` says whether to give up, from the steps tried and
-        where they have led.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the information is singular: the window says nothing about a parameter.
+        where they have led. Raises LinAlgError if the window says nothing about a parameter, so that the information is
+        singular.
         """
         model = self._model
         diagnosed, damping, steps, looks = slice(model.cutoff_at), 1e-3, 0, 0

@@ -85,12 +85,7 @@ def estimate_unbalance(
     `covariance`, shape (5, 5), is that of the logarithmic ratios of the structural parameters at the estimate, `point`;
     `synchronous`, shape (n_states,), is q, SI. If `sized`, the zero of its angle is unknown, so that only its size
     counts: it is turned to the heavy spot. If `backward`, the shaft turns from z to y although the speed is positive
-    (one found in the vibration always is).
-
-    Raises
-    ------
-    EstimationError
-        If the vector does not determine e.
+    (one found in the vibration always is). Raises EstimationError if the vector does not determine e.
     """
     rotor = machine.rotor
     w = np.array([speed_rad_s])

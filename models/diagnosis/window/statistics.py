@@ -373,13 +373,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
 
 
 def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) -> WindowLevels:
-    """Vibration levels of the window that hops make, see `window_levels`.
-
-    Raises
-    ------
-    ValueError
-        If the plan holds none.
-    """
+    """Vibration levels of the window that hops make, see `window_levels`; raises ValueError if none are planned."""
     if plan.levels is None:
         raise ValueError("no levels are planned")
     rotation = rotation_of(plan, hops)
