@@ -56,6 +56,9 @@ _WANDERS = 0.002
 _MISFITS = 6  # windows in a row that misfit before the next one is searched cold: they may all share a wrong maximum
 _FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
+_Band = tuple[FloatArray, npt.NDArray[np.bool_]]
+"""Frequencies of a window's bins, and which of them are excluded."""
+
 
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
@@ -76,7 +79,7 @@ class LikelihoodFit:
         self._strength: float | None = None
         self._line: Linearised | None = None
         self._line_segments = self._followed = self._misfits = 0
-        self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
+        self._line_band: _Band | None = None
         self._latest: tuple[SpectralModel, Expected, FloatArray, float] | None = None
         self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
         self._groups: dict[bytes, BinGroups] = {}
@@ -101,12 +104,11 @@ class LikelihoodFit:
         }
         line = self._line
         if line is not None and self._line_band is not None:
-            motions = line.model.motions
             frequencies_hz, excluded = self._line_band
             found |= prefixed("line", line.checkpoint())
             found |= {
-                "states": np.array(motions.states, dtype=np.str_),
-                "scale": motions.scale,
+                "states": np.array(line.model.motions.states, dtype=np.str_),
+                "scale": line.model.motions.scale,
                 "force_scale": np.array(line.model.force_unit[0], dtype=np.float64),
                 "line_strength": np.array(line.weights.strength, dtype=np.float64),
                 "frequencies_hz": frequencies_hz,
@@ -115,13 +117,7 @@ class LikelihoodFit:
         return found
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Continue where `checkpoint` was called: the next readings are the same to the last bit.
-
-        Raises
-        ------
-        CheckpointError
-            If the arrays are not of a fit of this machine; nothing is changed then.
-        """
+        """Continue where `checkpoint` was called, with the same bits; what raises has changed nothing."""
         last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
         segments, followed, misfits = checked(arrays, "followed", np.int64, (3,)).tolist()
         line = band = None
@@ -130,7 +126,7 @@ class LikelihoodFit:
             band = frequencies_hz, checked(arrays, "excluded", np.bool_, frequencies_hz.shape)
             try:
                 with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                    line = self._restored_line(arrays, segments, *band)
+                    line = self._restored_line(arrays, segments, band)
             except np.linalg.LinAlgError as error:
                 raise CheckpointError(f"{self._machine.name}: the remembered maximum makes no valid spectra") from error
         self._last = last if last.size else None
@@ -138,16 +134,9 @@ class LikelihoodFit:
         self._line, self._line_band, self._line_segments = line, band, segments
         self._followed, self._misfits = followed, misfits
 
-    def _restored_line(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        segments: int,
-        frequencies_hz: FloatArray,
-        excluded: npt.NDArray[np.bool_],
-    ) -> Linearised:
-        states = texts(arrays, "states")
-        unknown = [name for name in states if name not in STATE_INDEX]
-        if unknown or frequencies_hz.size < 2 or excluded.all():
+    def _restored_line(self, arrays: Mapping[str, np.ndarray], segments: int, band: _Band) -> Linearised:
+        states, (frequencies_hz, excluded) = texts(arrays, "states"), band
+        if not STATE_INDEX.keys() >= set(states) or frequencies_hz.size < 2 or excluded.all():
             raise CheckpointError(
                 f"{self._machine.name}: the remembered maximum is that of states {', '.join(states)} at "
                 f"{frequencies_hz.size} frequencies, {np.count_nonzero(excluded)} of them excluded"
@@ -156,10 +145,9 @@ class LikelihoodFit:
         force_scale = float(checked(arrays, "force_scale", np.float64, ()))
         line = unprefixed("line", arrays)
         speeds = 2 if checked(line, "speeds_rad_s", np.float64, (None,)).size > 3 else 1
-        model = SpectralModel(self._machine, motions, self._grouped(frequencies_hz, excluded, speeds), force_scale)
+        model = SpectralModel(self._machine, motions, self._grouped(band, speeds), force_scale)
         strength = float(checked(arrays, "line_strength", np.float64, ()))
-        weights = Weights(model, segments, self._usual_cutoff_hz, strength)
-        return Linearised.restored(model, weights, line)
+        return Linearised.restored(model, Weights(model, segments, self._usual_cutoff_hz, strength), line)
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
@@ -175,28 +163,28 @@ class LikelihoodFit:
             self.reset()
         window = integrated(window)
         speed, speeds = self._speed(window), self._speeds(window)
-        excluded = _near_lines(window, speed)
-        power = self._checked_power(window, ~excluded)
-        states = self._grouped(window.frequencies_hz, excluded, _count(speeds)).average(window.spectrum)
-        no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
+        band = window.frequencies_hz, _near_lines(window, speed)
+        scale = np.sqrt(self._checked_power(window, ~band[1]))
+        states = self._grouped(band, _count(speeds)).average(window.spectrum)
         try:
             # Trial points may lie far out; their results are checked, so no warnings are needed.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speeds, states)
+                model, weights, found = self._followed_or_searched(window, band, scale, speeds, states)
             known = np.linalg.inv(found.information) if found.covariance is None else found.covariance
             covariance: FloatArray = np.asarray(known, dtype=np.float64)
+            if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
+                raise np.linalg.LinAlgError("no maximum")
         except np.linalg.LinAlgError as error:
             self.reset()
-            raise UnexplainedError(no_maximum) from error
-        if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
-            self.reset()
-            raise UnexplainedError(no_maximum)
+            raise UnexplainedError(
+                f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
+            ) from error
         self._last, self._strength = found.theta, weights.strength
         why, nowhere = unexplained_at(model, weights, found.whitened, states)
         unexplained = self._stated(why)
         if nowhere:
             raise UnexplainedError(unexplained)
-        goodness = goodness_of_fit(self._machine, model, weights, found, states)
+        goodness = goodness_of_fit(model, weights, found, states)
         self._misfits = self._misfits + 1 if goodness.misfit_z > MOST_MISFIT else 0
         if not unexplained and goodness.misfit_z > MOST_MISFIT:
             unexplained = self._stated(unseen(model, weights, found, goodness.misfit_z))
@@ -238,14 +226,14 @@ class LikelihoodFit:
         line, speed = self._line, self._speed(stretch)
         if line is None:
             return None
-        groups = self._grouped(stretch.frequencies_hz, _near_lines(stretch, speed), line.model.groups.speeds)
+        groups = self._grouped((stretch.frequencies_hz, _near_lines(stretch, speed)), line.model.groups.speeds)
         if not groups.same_as(line.model.groups) or stretch.states != line.model.motions.states:
             return None
         seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
         if seen is None:
             return None
         try:
-            return self._read(stretch, line.model, seen.point, seen.structural, speed)[0]
+            return self._read(stretch, line.model, *seen, speed)[0]
         except EstimationError:
             return None
 
@@ -265,7 +253,7 @@ class LikelihoodFit:
         differs = max(moved.real**2 / vector.variance_real, moved.imag**2 / vector.variance_imaginary)
         if seen is None or not share * differs <= _DIFFERS**2:
             return True
-        values = np.append(np.expm1(seen.point.theta[: len(STRUCTURAL)]), unbalance.change + moved.real)
+        values = np.append(np.expm1(seen[0].theta[: len(STRUCTURAL)]), unbalance.change + moved.real)
         stands_out = values @ np.linalg.solve(read.full_covariance, values)
         stands_out += (vector.imaginary + moved.imag) ** 2 / vector.variance_imaginary
         return not share * stands_out <= _STANDS_OUT**2
@@ -324,12 +312,7 @@ class LikelihoodFit:
         return ratios.decided(directed=window.directed)
 
     def _followed_or_searched(
-        self,
-        window: WindowStatistics,
-        excluded: npt.NDArray[np.bool_],
-        scale: FloatArray,
-        speed: Speeds,
-        states: ComplexArray,
+        self, window: WindowStatistics, band: _Band, scale: FloatArray, speed: Speeds, states: ComplexArray
     ) -> tuple[SpectralModel, Weights, Maximum]:
         found = None
         line, self._line = self._line, None
@@ -338,24 +321,23 @@ class LikelihoodFit:
             and self._followed < _FOLLOWED
             and window.n_segments == self._line_segments
             and window.states == line.model.motions.states
-            and self._grouped(window.frequencies_hz, excluded, _count(speed)).same_as(line.model.groups)
+            and self._grouped(band, _count(speed)).same_as(line.model.groups)
         ):
             self._followed += 1
             found = line.follow(line.model.observed(states), speed, _NEAR, _GAIN)
             if found is not None:
                 self._line = line
                 return line.model, line.weights, found
-            search = self._search(line.model, window, speed, self._strength)
             # The units stay the same, and the first step uses the derivatives where the last search ended.
-            model = line.model
+            model, search = line.model, self._search(line.model, window, speed, self._strength)
             with suppress(np.linalg.LinAlgError):  # unless that makes no valid spectrum for this window
                 found = search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
         if found is None:
-            model, search, found = self._maximise(window, excluded, scale, speed)
+            model, search, found = self._maximise(window, band, scale, speed)
             self._followed = 0
         if self._follow:
             self._line, self._line_segments = Linearised.around(model, search.weights, found), window.n_segments
-            self._line_band = window.frequencies_hz, excluded
+            self._line_band = band
         return model, search.weights, found
 
     def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
@@ -367,19 +349,26 @@ class LikelihoodFit:
             )
         observed = window.spectrum[used]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
-        if twins := _twins(window.states, observed):
-            raise EstimationError(f"{self._machine.name}: channels {' and '.join(twins)} carry the same signal")
-        if dead := _dead(window.states, power):
+        # The difference of two states with the same signal is nothing but rounding.
+        cross = observed.real.mean(axis=0)
+        own = np.diag(cross)[:, np.newaxis]
+        for later, earlier in np.argwhere(np.tril(own + np.diag(cross) - 2 * cross < 1e-9 * own, -1)):
+            twins = f"{window.states[earlier]} and {window.states[later]}"
+            raise EstimationError(f"{self._machine.name}: channels {twins} carry the same signal")
+        # A dead state has less than a thousandth of the amplitude of another one of its kind.
+        rates = np.array([name.endswith("_dot") for name in window.states])
+        largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
+        if dead := [window.states[at] for at in np.flatnonzero(~(power > 1e-6 * largest))]:
             raise EstimationError(
                 f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
             )
         return np.asarray(power, dtype=np.float64)
 
     def _maximise(
-        self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: Speeds
+        self, window: WindowStatistics, band: _Band, scale: FloatArray, speed: Speeds
     ) -> tuple[SpectralModel, FisherScoring, Maximum]:
         """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
-        groups = self._grouped(window.frequencies_hz, excluded, _count(speed))
+        groups = self._grouped(band, _count(speed))
         motions = Motions(window.states, scale)
         force_scale = usual_force(self._machine, motions, groups, speed, self._usual_cutoff_hz)
         model = SpectralModel(self._machine, motions, groups, force_scale)
@@ -390,7 +379,7 @@ class LikelihoodFit:
             except np.linalg.LinAlgError:  # the old point makes no valid spectrum for this window
                 self.reset()
                 search = self._search(model, window, speed)
-        wide = self._grouped(window.frequencies_hz, excluded, _count(speed), _COARSE)
+        wide = self._grouped(band, _count(speed), _COARSE)
         coarse = SpectralModel(self._machine, motions, wide, force_scale, shapes=0)
         first = self._search(coarse, window, speed)
         start = starting_point(coarse, _observed(coarse, window), first.weights.centre, self._speed(window))
@@ -410,10 +399,9 @@ class LikelihoodFit:
         observed = _observed(model, window)
         return FisherScoring(model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength)
 
-    def _grouped(
-        self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], speeds: int, coarser: float = 1.0
-    ) -> BinGroups:
-        """Groups for frequencies and excluded bins, remembered while the speed stays in the same bin."""
+    def _grouped(self, band: _Band, speeds: int, coarser: float = 1.0) -> BinGroups:
+        """Groups for a band, remembered while the speed stays in the same bin."""
+        frequencies_hz, excluded = band
         key = frequencies_hz.tobytes() + excluded.tobytes() + bytes([speeds, int(coarser)])
         if key not in self._groups:
             if len(self._groups) >= 8:
@@ -458,21 +446,3 @@ def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
     passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
     return np.asarray((np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0])) | window.line_bins)
-
-
-def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:
-    """Two states whose difference is nothing but rounding; empty if there are none."""
-    cross = observed.real.mean(axis=0)
-    power = np.diag(cross)
-    for i, first in enumerate(states):
-        for j in range(i):
-            if power[i] + power[j] - 2 * cross[i, j] < 1e-9 * power[i]:
-                return states[j], first
-    return ()
-
-
-def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
-    """States without fluctuation: less than a thousandth of the amplitude of another one of their kind."""
-    rates = np.array([name.endswith("_dot") for name in states])
-    largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
-    return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]

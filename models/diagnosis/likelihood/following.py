@@ -11,7 +11,7 @@ weights, so hardly any precision is lost. The levels are stepped as elements of 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,16 +24,7 @@ from models.diagnosis.likelihood.scoring import (
     inverse_factor,
     whitened_at,
 )
-from models.diagnosis.likelihood.spectral_model import (
-    COLUMNS,
-    ROWS,
-    Expected,
-    ModelPoint,
-    SpectralModel,
-    Speeds,
-    factor_of,
-    packed,
-)
+from models.diagnosis.likelihood.spectral_model import ROWS, Expected, ModelPoint, SpectralModel, Speeds, packed
 from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
@@ -44,14 +35,6 @@ _NEWS = 3.0
 # Excess over the theory beyond which a stretch gets a search of its own. The margin is for a changed excitation level,
 # which counts as excess in full.
 _LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15
-
-
-@dataclass(frozen=True, slots=True)
-class Glance:
-    """Result of one step from the window's maximum for a stretch that agrees with the window."""
-
-    point: Expected  # the diagnosed parameters are the stretch's; all others, and the spectra, are the window's
-    structural: FloatArray  # (n_diagnosed, n_diagnosed), covariance of the diagnosed parameters
 
 
 class Linearised:
@@ -83,12 +66,10 @@ class Linearised:
     @classmethod
     def around(cls, model: SpectralModel, weights: Weights, found: Maximum) -> "Linearised":
         """Linearise around the maximum of a search that has just ended, with its slopes."""
-        point, slopes = found.whitened.point.expected, found.slopes
-        information = np.asarray(found.information - np.diag(weights.pull), dtype=np.float64)
-        derivatives = Derivatives(slopes, information, found.slopes_rad_s)
+        point = found.whitened.point.expected
         # Where only the pulls on T determine the levels, the equation keeps the gradient that the search ended with.
-        left = _gradient(slopes, packed(found.whitened.excess), weights)[model.level_at]
-        return cls(model, weights, point, point, derivatives, left, found.fitted)
+        left = _gradient(found.derivatives.slopes, packed(found.whitened.excess), weights)[model.level_at]
+        return cls(model, weights, point, point, found.derivatives, left, found.fitted)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the model and the weights do not hold, as named arrays.
@@ -110,15 +91,7 @@ class Linearised:
 
     @classmethod
     def restored(cls, model: SpectralModel, weights: Weights, arrays: Mapping[str, np.ndarray]) -> "Linearised":
-        """Restore what `checkpoint` returned.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        numpy.linalg.LinAlgError
-            If the point gives no valid spectra.
-        """
+        """Restore what `checkpoint` returned; raises LinAlgError if the point gives no valid spectra."""
         size = (model.size,)
         theta = checked(arrays, "searched", np.float64, size)
         speeds = checked(arrays, "speeds_rad_s", np.float64, (3 * model.groups.speeds,)).tolist()
@@ -139,7 +112,7 @@ class Linearised:
             model.at(theta, of_searched),
             model.at(point, of_point, levels).expected,
             Derivatives(slopes, information, of_slopes),
-            checked(arrays, "left", np.float64, (COLUMNS.size,)),
+            checked(arrays, "left", np.float64, (ROWS.size,)),
             float(checked(arrays, "fitted", np.float64, ())),
         )
 
@@ -165,30 +138,24 @@ class Linearised:
                 if whitened is None:
                     return None
                 self._point = there.expected
-                own = self.derivatives
-                information = own.information + np.diag(self._pull)
-                return Maximum(
-                    point.theta,
-                    information,
-                    own.slopes,
-                    own.speed_rad_s,
-                    whitened,
-                    steps,
-                    self._fitted,
-                    step[diagnosed],
-                    covariance,
-                )
+                information = self.derivatives.information + np.diag(self._pull)
+                remaining = step[diagnosed]
+                return Maximum(information, self.derivatives, whitened, steps, self._fitted, remaining, covariance)
             if steps == _MOST_STEPS or left > before:
                 break
             before = left
-            point = there = self._moved(point, step, speed_rad_s)
+            point = there = model.stepped(point, step, speed_rad_s)
             expected = np.einsum("fii->fi", point.S).real
             if not np.mean((expected / self._S - 1) ** 2) < _FARTHEST**2:
                 break
         return None
 
-    def glance(self, observed: ComplexArray, share: float) -> Glance | None:
-        """Take one step from the latest maximum for a stretch, a share of the window; None if it differs from that."""
+    def glance(self, observed: ComplexArray, share: float) -> tuple[Expected, FloatArray] | None:
+        """Take one step from the latest maximum for a stretch, a share of the window; None if it differs from that.
+
+        The diagnosed parameters of the point are the stretch's, all others, and the spectra, the window's. With it
+        comes the covariance of the diagnosed parameters, shape (n_diagnosed, n_diagnosed).
+        """
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
         gradient = _gradient(self.derivatives.slopes, rest, self.weights)
@@ -207,7 +174,7 @@ class Linearised:
         scatter = model.n * float(np.sqrt(2 * np.sum(model.groups.shared**2)))
         if total > _EXCESS_MARGIN * usual + _LEAST_EXCESS_Z * scatter:
             return None
-        return Glance(replace(point, theta=theta), np.asarray(structural, dtype=np.float64))
+        return replace(point, theta=theta), np.asarray(structural, dtype=np.float64)
 
     def _whitened(self, difference: ComplexArray) -> FloatArray:
         """L₀⁻¹ X L₀⁻ᴴ, packed, shape (n_groups, n²)."""
@@ -225,19 +192,6 @@ class Linearised:
             information = share * self.derivatives.information + np.diag(self._pull)
             self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return self._inverses[share]
-
-    def _moved(self, point: Expected, step: FloatArray, speed_rad_s: Speeds) -> ModelPoint:
-        """The point after a step: logarithms move by at most one, noise variances and C linearly."""
-        model = self.model
-        theta = point.theta.copy()
-        logarithms = slice(model.level_at.start)
-        theta[logarithms] += np.clip(step[logarithms], -1, 1)
-        theta[model.noise_at] = point.theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
-        C = point.C.copy()
-        C[ROWS, COLUMNS] += step[model.level_at]
-        C[COLUMNS, ROWS] = C[ROWS, COLUMNS]
-        theta[model.level_at] = factor_of(C)[ROWS, COLUMNS]
-        return model.at(theta, speed_rad_s, C)
 
 
 def _gradient(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:

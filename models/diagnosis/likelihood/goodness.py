@@ -16,11 +16,10 @@ import numpy.typing as npt
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
+from models.diagnosis.likelihood.spectral_model import IDENTITY, STRUCTURAL, Sides, SpectralModel, packed, twice_packed
 from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, AlternativeTest, Goodness
 from models.diagnosis.readings import beyond
-from models.diagnosis.window.moments import ComplexArray, through
-from models.machine import Machine
+from models.diagnosis.window.moments import ComplexArray
 from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, parts_seen, state_name
@@ -34,18 +33,16 @@ _OTHER_PLANE = str.maketrans("yz", "zy")
 _LEAST_INFORMATION = 1e-4
 
 
-def goodness_of_fit(
-    machine: Machine, model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray
-) -> Goodness:
+def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> Goodness:
     """Test the alternatives at the maximum of one window.
 
     `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); with them,
     displacement and velocity are also compared with each other.
     """
-    names, slopes = _alternatives(machine, model, found)
+    names, slopes = _alternatives(model, found)
     seen = packed(found.whitened.excess)
     weight = weights.averages[:, None]
-    flat = found.slopes.reshape(model.size, -1)
+    flat = found.derivatives.slopes.reshape(model.size, -1)
     weighted = (slopes * weight).reshape(len(names), -1)
     cross = weighted @ flat.T
     projection = np.linalg.solve(found.information, cross.T).T
@@ -79,16 +76,13 @@ def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> Alte
     return AlternativeTest(v, mismatch.z, mismatch.change, mismatch.states)
 
 
-def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
+def _alternatives(model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
     """Names and packed slopes of all alternatives, shape (n_alternatives, n_groups, n²)."""
     point, L_inverse = found.whitened.point, found.whitened.L_inverse
-    whitened: ComplexArray = L_inverse[:, None] @ point.G
-    response = through(point.C, whitened)
-    coloured = point.S @ L_inverse.conj().swapaxes(1, 2)
-    names, of_sensors = _of_sensors(machine, model, L_inverse, coloured)
+    names, of_sensors = _of_sensors(model, L_inverse, point.S @ L_inverse.conj().swapaxes(1, 2))
     slopes = list(of_sensors)
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
-    rotor, sides = machine.rotor, model.sides(point, whitened, response)
+    rotor, sides = model.machine.rotor, Sides(point, L_inverse)
     for (name, first), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
         names.append(name)
         slopes.append(sides.slope(mass * w2, slice(first, None, 3)))
@@ -98,15 +92,13 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     return names, np.stack(slopes)
 
 
-def _of_sensors(
-    machine: Machine, model: SpectralModel, L_inverse: ComplexArray, coloured: ComplexArray
-) -> tuple[list[str], FloatArray]:
+def _of_sensors(model: SpectralModel, L_inverse: ComplexArray, coloured: ComplexArray) -> tuple[list[str], FloatArray]:
     """Names and packed slopes of sensor errors: gain, sensitivity to the other plane, and delay.
 
     `coloured` is SL⁻ᴴ.
     """
     motions, w = model.motions, model.centre
-    names, at_once, weights, by, shown, into = _tried(tuple(machine.sensors), motions.states)
+    names, at_once, weights, by, shown, into = _tried(tuple(model.machine.sensors), motions.states)
     shares, factor = motions.shares(w), motions.factor(w, w)
     share = np.stack([shares[state][1] for state in motions.states])[by]
     seen = (share * (factor[:, into] / factor[:, shown]).T)[..., None] * coloured.swapaxes(0, 1)[shown]
@@ -194,14 +186,11 @@ def unexplained_at(
     impossible = abs(log_ratio) > times * _MOST_LOG_RATIO
     most = _MOST_DEVIATION if abs(log_ratio) <= _LARGE else _MOST_DEVIATION_LARGE
     if far or deviation > times * most:
-        text, limit = beyond(100 * deviation, 100 * most)
+        (text, limit), line = beyond(100 * deviation, 100 * most), ""
         where = int(squared.argmax())
         there = slice(max(0, where - _SKIRTS), where + _SKIRTS + 1)
-        line = (
-            f", most of it at {model.groups.centre_hz[where]:.3g} Hz"
-            if 2 * squared[there].sum() > squared.sum()
-            else ""
-        )
+        if 2 * squared[there].sum() > squared.sum():
+            line = f", most of it at {model.groups.centre_hz[where]:.3g} Hz"
         why = f"its spectra deviate from it by {text} % (rms, without sampling error){line}, evaluation limit {limit} %"
         return why, far or impossible
     # Noise is a sensor's own: what both sensors of a motion show is motion, here motion that the theory cannot explain.
@@ -226,7 +215,7 @@ def unseen(model: SpectralModel, weights: Weights, found: Maximum, misfit_z: flo
     """
     n = len(STRUCTURAL)
     usual = weights.centre.copy()
-    usual[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+    usual[model.level_at] = IDENTITY
     point = model.at(usual, found.whitened.point.speed_rad_s)
     slopes = model.slopes(point, inverse_factor(point.S)) * np.sqrt(weights.averages)[:, None]
     flat = slopes.reshape(model.size, -1)

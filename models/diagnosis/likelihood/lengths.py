@@ -36,13 +36,7 @@ class LengthFits:
         return found
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Continue where `checkpoint` was called: the next readings are the same to the last bit.
-
-        Raises
-        ------
-        CheckpointError
-            If the arrays are not of this machine; nothing is changed then.
-        """
+        """Continue where `checkpoint` was called, with the same bits; what raises has changed nothing."""
         hop = int(checked(arrays, "hop", np.int64, ()))
         searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
         window = LikelihoodFit(self._machine, follow=True, sized=self._sized)
@@ -53,13 +47,7 @@ class LengthFits:
         self._hop, self._searched, self._window, self._short = hop, searched, window, short
 
     def window(self, window: WindowStatistics) -> Diagnosis:
-        """Estimate the parameters of the window at the next hop.
-
-        Raises
-        ------
-        EstimationError
-            As `LikelihoodFit.diagnose`.
-        """
+        """Estimate the parameters of the window at the next hop; raises as `LikelihoodFit.diagnose`."""
         self._hop += 1
         return self._window.diagnose(window)
 
@@ -91,12 +79,8 @@ class LengthFits:
     def short(self, hops: int, stretch: WindowStatistics, *, closely: bool = False) -> Diagnosis:
         """Estimate the parameters of the window's newest hops, by `LikelihoodFit.glance` if they agree with the window.
 
-        If `closely`, they are always searched: a glance does not tell whether the stretch is outside the model.
-
-        Raises
-        ------
-        EstimationError
-            As `LikelihoodFit.diagnose`.
+        If `closely`, they are always searched: a glance does not tell whether the stretch is outside the model. Raises
+        as `LikelihoodFit.diagnose`.
         """
         seen = None if closely else self._window.glance(stretch)
         if seen is not None:

@@ -127,8 +127,8 @@ def group_bins(
     in_band = modes_hz < 1.2 * frequencies_hz[-1]
     decay = float(np.min(2 * np.pi * (damping * modes_hz)[in_band], initial=np.inf)) / spacing
     kernel, finer = (_KERNEL, 1) if decay > _RINGING else (_FINE_KERNEL, 2)
-    reach = (kernel.size - 1) // 2
-    n_nodes = finer * (max(end - first for first, end in edges) - 1) + kernel.size
+    reach, bins = (kernel.size - 1) // 2, np.array([end - first for first, end in edges], dtype=np.float64)
+    n_nodes = finer * (int(bins.max()) - 1) + kernel.size
     nodes_hz, weights = np.empty((len(edges), n_nodes)), np.zeros((len(edges), n_nodes))
     for group, (first, end) in enumerate(edges):
         comb = np.zeros(finer * (end - first - 1) + 1)
@@ -139,11 +139,11 @@ def group_bins(
         nodes_hz[group] = np.abs(frequencies_hz[first] + spacing / finer * steps)
     return BinGroups(
         edges=tuple(edges),
-        bins=np.array([end - first for first, end in edges], dtype=np.float64),
+        bins=bins,
         centre_hz=np.array([frequencies_hz[first:end].mean() for first, end in edges]),
         nodes_hz=np.tile(nodes_hz, speeds),
         weights=np.tile(weights, speeds) / speeds,
-        shared=_shared_scatter(edges, frequencies_hz.size),
+        shared=_shared_scatter(edges, frequencies_hz.size) / np.sqrt(np.outer(bins, bins)),
         speeds=speeds,
     )
 
@@ -159,8 +159,7 @@ def _shared_scatter(edges: list[tuple[int, int]], n_bins: int) -> FloatArray:
         np.add.at(shared, (left[both], right[both]), correlation)
         if apart:
             np.add.at(shared, (right[both], left[both]), correlation)
-    width = np.array([end - first for first, end in edges])
-    return shared / np.sqrt(np.outer(width, width))
+    return shared
 
 
 _ABSENT = -1
@@ -187,16 +186,12 @@ class Motions:
         self.states, self.scale = states, scale
         column = {STATE_INDEX[name]: at for at, name in enumerate(states)}
         self.dofs = np.array([dof for dof in range(6) if dof in column or dof + 6 in column])
+        self.n = self.dofs.size
         self._x = np.array([column.get(dof, _ABSENT) for dof in self.dofs])
         self._v = np.array([column.get(dof + 6, _ABSENT) for dof in self.dofs])
         self._has_x, self._has_v = self._x != _ABSENT, self._v != _ABSENT
         self._unit_x = np.where(self._has_x, scale[self._x], 1.0)
         self._unit_v = np.where(self._has_v, scale[self._v], 1.0)
-
-    @property
-    def n(self) -> int:
-        """Number of motions."""
-        return self.dofs.size
 
     def _r(self, w: FloatArray) -> FloatArray:
         """Ratio r of the module's docstring, shape (…, n); 0 for a motion that only one sensor measures."""

@@ -42,8 +42,8 @@ class Whitened:
 class Derivatives:
     """Derivatives at the end of an earlier search, which save most of the first step of a search that starts there."""
 
-    slopes: FloatArray  # (size, n_groups, n²)
-    information: FloatArray  # (size, size), of the data without pulls, levels as elements of C
+    slopes: FloatArray  # (size, n_groups, n²), whitened
+    information: FloatArray  # (size, size), made of them: of the data without pulls, levels as elements of C
     speed_rad_s: Speeds  # speed for which they were computed
 
 
@@ -51,11 +51,8 @@ class Derivatives:
 class Maximum:
     """Where a search ended."""
 
-    theta: FloatArray  # (size,), the parameter point
     information: FloatArray  # (size, size), Fisher information there, on the elements of C (not of T)
-    slopes: FloatArray  # (size, n_groups, n²), whitened slopes that the information is made of
-    # Speed for which they were computed: that of the window, or of the search whose slopes were reused.
-    slopes_rad_s: Speeds
+    derivatives: Derivatives  # of the window's own speed, or of the search whose slopes were reused
     whitened: Whitened  # theory and estimate there
     steps: int  # steps tried
     fitted: float  # effective number of parameters that the window determined, not the weak pulls
@@ -63,6 +60,11 @@ class Maximum:
     # error if it has converged
     remaining: FloatArray
     covariance: FloatArray | None = None  # (size, size), inverse of the information where that is known already
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameter point."""
+        return self.whitened.point.theta
 
 
 class Weights:
@@ -75,7 +77,7 @@ class Weights:
     def __init__(
         self, model: SpectralModel, n_segments: int, usual_cutoff_hz: float, strength: float | None = None
     ) -> None:
-        self._shape_at, self._level_at = model.shape_at, model.level_at
+        self._level_at = model.level_at
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
         self.ridge = np.full(model.size, _WEAK)
         self.ridge[: model.cutoff_at] = 0.0  # diagnosed parameters are not pulled
@@ -98,11 +100,6 @@ class Weights:
         pull = self.ridge.copy()
         pull[self._level_at] = 1e-3
         return pull
-
-    def pull_colours(self, strength: float) -> None:
-        """Pull the forces' own colours with another strength."""
-        self.strength = strength
-        self.ridge[self._shape_at] = strength
 
 
 class FisherScoring:
@@ -137,32 +134,19 @@ class FisherScoring:
         derivatives: Derivatives | None = None,
         hopeless: Callable[[int, Whitened], bool] | None = None,
     ) -> Maximum:
-        """Search from a starting point.
+        """Search from a starting point, shape (size,), where `derivatives` are known if an earlier search ended there.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (size,)
-        near, gain : float
-            Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
-            gain less than `gain` in log-likelihood.
-        derivatives : Derivatives, optional
-            Those at `theta` if an earlier search has ended there.
-        hopeless : callable, optional
-            Whether to give up, from the steps tried and where they have led.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the information is singular: the window says nothing about a parameter.
+        The search has converged when a full step would move no diagnosed parameter by more than `near` standard errors
+        and would gain less than `gain` in log-likelihood. `hopeless` says whether to give up, from the steps tried and
+        where they have led. Raises LinAlgError if the window says nothing about a parameter, so that the information is
+        singular.
         """
         model = self._model
-        diagnosed, logarithms = slice(model.cutoff_at), slice(model.level_at.start)
-        damping, steps, looks = 1e-3, 0, 0
+        diagnosed, damping, steps, looks = slice(model.cutoff_at), 1e-3, 0, 0
         value, whitened = self._value(theta)
         if whitened is None:
             raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
-        gradient, information, slopes, on_levels = self._scores(theta, whitened, derivatives)
-        slopes_rad_s = self._speed_rad_s if derivatives is None else derivatives.speed_rad_s
+        gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened, derivatives)
         while True:
             covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
@@ -176,26 +160,21 @@ class FisherScoring:
                 value, whitened = self._value(theta)
                 if whitened is None:
                     raise AssertionError("a point that made a valid spectrum still makes one")
-                gradient, information, slopes, on_levels = self._scores(theta, whitened)
-                slopes_rad_s = self._speed_rad_s
+                gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened)
                 continue
             steps += 1
-            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
-            trial = theta + step
-            # Logarithms move by at most one: far from the data the slopes mislead. A noise variance takes the scoring
-            # step on the variance itself.
-            trial[logarithms] = theta[logarithms] + np.clip(step[logarithms], -1, 1)
-            trial[model.noise_at] = theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
+            damped = information + damping * np.diag(np.diag(information))
+            trial = model.moved(theta, np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
             trial_value, trial_whitened = self._value(trial)
             if trial_whitened is not None and trial_value > value:
                 theta, value, whitened = trial, trial_value, trial_whitened
-                gradient, information, slopes, on_levels = self._scores(theta, whitened)
-                slopes_rad_s = self._speed_rad_s
+                gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened)
                 damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
         fitted = model.size - float(self.weights.ridge @ np.diag(covariance))
-        return Maximum(theta, on_levels, slopes, slopes_rad_s, whitened, steps, fitted, full_step[diagnosed])
+        reached = Derivatives(slopes, on_levels - np.diag(self.weights.pull), slopes_rad_s)
+        return Maximum(on_levels, reached, whitened, steps, fitted, full_step[diagnosed])
 
     def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
         """Set the strength that has the largest evidence for the colours found; False if it hardly changed.
@@ -210,7 +189,7 @@ class FisherScoring:
         slope = vectors.T @ (precision @ theta[at])
         evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
         new = float(_STRENGTHS[np.argmax(evidence)])
-        self.weights.pull_colours(new)
+        self.weights.strength = self.weights.ridge[at] = new
         return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
@@ -225,14 +204,14 @@ class FisherScoring:
 
     def _scores(
         self, theta: FloatArray, whitened: Whitened, derivatives: Derivatives | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Gradient and information with respect to T, packed slopes, and information with respect to C."""
-        model, averages = self._model, self.weights.averages
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Speeds]:
+        """Gradient and information with respect to T, packed slopes, information with respect to C, slopes' speed."""
+        model, averages, speed_rad_s = self._model, self.weights.averages, self._speed_rad_s
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
             on_levels = information_of(slopes, self.weights, self._weighted)
         else:
-            slopes, on_levels = derivatives.slopes, derivatives.information.copy()
+            slopes, on_levels, speed_rad_s = derivatives.slopes, derivatives.information.copy(), derivatives.speed_rad_s
         excess = packed(whitened.excess) * averages[:, None]
         gradient: FloatArray = slopes.reshape(model.size, -1) @ excess.ravel()
         levels = model.level_at
@@ -245,7 +224,7 @@ class FisherScoring:
         gradient -= self.weights.ridge * (theta - self.weights.centre)
         information[np.diag_indices(model.size)] += self.weights.ridge
         on_levels[np.diag_indices(model.size)] += self.weights.pull
-        return gradient, information, slopes, on_levels
+        return gradient, information, slopes, on_levels, speed_rad_s
 
 
 def information_of(slopes: FloatArray, weights: Weights, out: FloatArray | None = None) -> FloatArray:
@@ -268,13 +247,7 @@ def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:
 
 
 def inverse_factor(S: ComplexArray) -> ComplexArray:
-    """L⁻¹ of S = L Lᴴ, shape (n_groups, n, n).
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If S are no valid spectra.
-    """
+    """L⁻¹ of S = L Lᴴ, shape (n_groups, n, n); raises LinAlgError if S are no valid spectra."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(S)), dtype=np.complex128)
 
 

@@ -45,6 +45,7 @@ those at a mixture of speeds are not, which would pass for a misfit.
 """
 SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
 ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
+IDENTITY = np.eye(6)[ROWS, COLUMNS]  # equal independent sources of level one
 _BEARING_DOFS = (0, 0, 3, 3)
 
 
@@ -95,16 +96,12 @@ class SpectralModel:
         self, machine: Machine, motions: Motions, groups: BinGroups, force_scale: float = 1.0, shapes: int = SHAPES
     ) -> None:
         rotor = machine.rotor
-        self.n = motions.n
-        self.motions = motions
-        self.shapes = shapes
+        self.machine, self.motions, self.n, self.shapes = machine, motions, motions.n, shapes
         # A moment acts through a lever of a third of the shaft, so that levels of forces and moments share one unit.
         lever = rotor.shaft_length_m / 3
         self.force_unit = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
-        self._rotor = rotor
         self._M, self._Q, self._Q_shaft = M_matrix(rotor), Q_matrix(rotor), Q_shaft(rotor)
         self._bearing = np.array([rotor.k_by_N_per_m, rotor.c_by_N_s_per_m, rotor.k_bz_N_per_m, rotor.c_bz_N_s_per_m])
-        self._band_hz = machine.window.band_hz
         self.cutoff_at = len(STRUCTURAL)
         self.order_at = self.cutoff_at + 1
         self.noise_at = slice(self.order_at + 1, self.order_at + 1 + len(motions.states))
@@ -122,7 +119,7 @@ class SpectralModel:
 
     def _see(self, groups: BinGroups) -> None:
         self.groups = groups
-        low, high = self._band_hz
+        low, high = self.machine.window.band_hz
         self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
         # In √f the polynomials resolve a low-pass at the lower end as well as a hump at the upper end.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
@@ -146,12 +143,27 @@ class SpectralModel:
         """
         change = self._bearing * np.expm1(structural[:4])
         Q = self._Q + self._Q_shaft * np.expm1(structural[4])
-        P = P_matrix(self._rotor, speed_rad_s)
-        Q[0, 0] += change[0]
-        P[0, 0] += change[1]
-        Q[3, 3] += change[2]
-        P[3, 3] += change[3]
-        return _receptance(self._M, P, Q, w)
+        M, P = self._M, P_matrix(self.machine.rotor, speed_rad_s)
+        Q[[0, 3], [0, 3]] += change[::2]
+        P[[0, 3], [0, 3]] += change[1::2]
+        # Both planes by cofactors, then the gyroscopic coupling g: [[A, g eeᵀ], [-g eeᵀ, B]]⁻¹ follows from A⁻¹, B⁻¹
+        # and their columns A⁻¹e and B⁻¹e. For hundreds of frequencies at once this takes a quarter of the time of
+        # inverting one matrix after the other.
+        diagonal = np.diag(Q)[:, None] - np.diag(M)[:, None] * w**2 + 1j * np.diag(P)[:, None] * w
+        p, q, r = diagonal.reshape(2, 3, w.size).swapaxes(0, 1)  # of each plane
+        a, b, c = (Q[[i, i + 3], [j, j + 3], None] for i, j in ((0, 1), (0, 2), (1, 2)))
+        pq, pr, qr = b * c - a * r, a * c - b * q, a * b - c * p
+        cofactors = np.array([[q * r - c**2, pq, pr], [pq, p * r - b**2, qr], [pr, qr, p * q - a**2]])
+        planes = (cofactors * (1 / (p * cofactors[0, 0] + a * pq + b * pr))).transpose(2, 0, 1, 3)
+        columns, tilts, g = planes[:, 2], planes[:, 2, 2], 1j * w * P[2, 5]
+        shared = g / (1 + g**2 * tilts[0] * tilts[1])
+        coupling = (shared * columns[0])[:, None] * columns[1]
+        turned = ((shared * g * tilts[::-1])[:, None] * columns)[:, :, None] * columns[:, None]
+        H = np.empty((w.size, 2, 3, 2, 3), dtype=np.complex128)
+        blocks = H.transpose(1, 3, 2, 4, 0)
+        blocks[0, 0], blocks[1, 1] = planes - turned
+        blocks[0, 1], blocks[1, 0] = -coupling, coupling.swapaxes(0, 1)
+        return H.reshape(-1, 6, 6)
 
     def dynamic_changes(self, structural: FloatArray, w: float) -> ComplexArray:
         """Derivatives of -ω²M + jωP + Q with respect to the logarithmic ratios of `STRUCTURAL`, shape (5, 6, 6)."""
@@ -202,6 +214,26 @@ class SpectralModel:
         S[:, diagonal, diagonal] += self.noise(theta)
         return ModelPoint(theta, S, C, speed_rad_s, G, H, self._place, unit)
 
+    def moved(self, theta: FloatArray, step: FloatArray) -> FloatArray:
+        """The parameter point after a step: logarithms move by at most one, as far from the data the slopes mislead.
+
+        A noise variance takes the scoring step on the variance itself.
+        """
+        moved, logarithms = theta + step, slice(self.level_at.start)
+        moved[logarithms] = theta[logarithms] + np.clip(step[logarithms], -1, 1)
+        moved[self.noise_at] = theta[self.noise_at] + np.log(np.clip(1 + step[self.noise_at], 0.2, 4))
+        return moved
+
+    def stepped(self, point: Expected, step: FloatArray, speed_rad_s: Speeds) -> ModelPoint:
+        """The point after a step that moves the elements of C, not of T, linearly."""
+        theta, C = self.moved(point.theta, step), point.C.copy()
+        C[ROWS, COLUMNS] += step[self.level_at]
+        C[COLUMNS, ROWS] = C[ROWS, COLUMNS]
+        values, vectors = np.linalg.eigh(C)
+        root = vectors * np.sqrt(np.maximum(values, 0))  # of the positive semidefinite matrix nearest to C
+        theta[self.level_at] = np.linalg.qr(root.T)[1].T[ROWS, COLUMNS]
+        return self.at(theta, speed_rad_s, C)
+
     def filter(self, theta: FloatArray) -> tuple[float, float]:
         """Cutoff (Hz) and order of the low-pass."""
         return float(np.exp(theta[self.cutoff_at])), float(np.exp(theta[self.order_at]))
@@ -224,10 +256,8 @@ class SpectralModel:
         parameter or a level is an outer product of columns of G and of G C Hᴴ plus its conjugate transpose. `out` is a
         buffer for the result: megabytes, better not allocated at every step.
         """
-        theta = point.theta
-        whitened = L_inverse[:, None] @ point.G
-        response = through(point.C, whitened)
-        sides = self.sides(point, whitened, response)
+        theta, sides = point.theta, Sides(point, L_inverse)
+        whitened, response = sides.whitened, sides.response
         if out is None:
             out = np.empty((self.size, self._w.shape[0], self.n * self.n))
         dynamic_change = self._bearing * np.exp(theta[:4])
@@ -235,9 +265,8 @@ class SpectralModel:
             factor = -dynamic_change[parameter] * (1j * self._w if parameter % 2 else np.ones_like(self._w))
             out[parameter] = sides.slope(factor, slice(dof, dof + 1))
         out[4] = sides.slope(-np.ones_like(self._w), change=self._Q_shaft * np.exp(theta[4]))
-        for at, slope in zip(
-            (self.cutoff_at, self.order_at), low_pass_slopes(self.groups.nodes_hz, *self.filter(theta)), strict=True
-        ):
+        of_filter = low_pass_slopes(self.groups.nodes_hz, *self.filter(theta))
+        for at, slope in zip((self.cutoff_at, self.order_at), of_filter, strict=True):
             out[at] = packed(_summed(response * slope[:, :, None, None], whitened))
         of_noise = L_inverse.transpose(2, 0, 1)
         densities = packed(of_noise[:, :, :, None] * of_noise.conj()[:, :, None, :])
@@ -252,17 +281,18 @@ class SpectralModel:
         out[self.level_at] = twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
         return out
 
-    def sides(self, point: ModelPoint, whitened: ComplexArray, response: ComplexArray) -> "Sides":
-        """Left and right factors of a change of the dynamic matrix, from L⁻¹G and its response L⁻¹GC."""
-        return Sides(whitened * (1 / point.unit), response.conj() @ point.H.swapaxes(2, 3))
 
-
-@dataclass(frozen=True, slots=True)
 class Sides:
-    """Left and right factors of a change of the dynamic matrix in the slope of the spectra."""
+    """Left and right factors of a change of the dynamic matrix in the slope of the spectra.
 
-    left: ComplexArray  # (n_groups, n_nodes, n, 6), L⁻¹G in SI units
-    right: ComplexArray  # the same shape, conjugate of L⁻¹GC Hᴴ
+    They are made of `whitened`, L⁻¹G, and its `response`, L⁻¹GC, both of shape (n_groups, n_nodes, n, 6).
+    """
+
+    def __init__(self, point: ModelPoint, L_inverse: ComplexArray) -> None:
+        self.whitened: ComplexArray = L_inverse[:, None] @ point.G
+        self.response = through(point.C, self.whitened)
+        self._left = self.whitened * (1 / point.unit)
+        self._right = self.response.conj() @ point.H.swapaxes(2, 3)
 
     def slope(
         self, factor: ComplexArray | FloatArray, dofs: slice = slice(None), change: FloatArray | None = None
@@ -272,41 +302,12 @@ class Sides:
         The block of the `dofs` changes by `factor`, shape (n_groups, n_nodes), times the symmetric matrix `change`,
         shape (n_dofs, n_dofs), by default the identity.
         """
-        n_groups, _, n, _ = self.left.shape
-        moved = self.left[..., dofs] * factor[..., None, None]
+        n_groups, _, n, _ = self._left.shape
+        moved = self._left[..., dofs] * factor[..., None, None]
         if change is not None:
             moved = through(change, moved)
-        left, right = (side.transpose(0, 2, 1, 3).reshape(n_groups, n, -1) for side in (moved, self.right[..., dofs]))
+        left, right = (side.transpose(0, 2, 1, 3).reshape(n_groups, n, -1) for side in (moved, self._right[..., dofs]))
         return twice_packed(np.asarray(left @ right.swapaxes(1, 2)))
-
-
-def _receptance(M: FloatArray, P: FloatArray, Q: FloatArray, w: FloatArray) -> ComplexArray:
-    """(-ω²M + jωP + Q)⁻¹, shape (n_frequencies, 6, 6): both planes by cofactors, then the gyroscopic coupling g.
-
-    [[A, g eeᵀ], [-g eeᵀ, B]]⁻¹ follows from A⁻¹, B⁻¹ and their columns A⁻¹e and B⁻¹e. For hundreds of frequencies at
-    once this takes a quarter of the time of inverting one matrix after the other.
-    """
-    diagonal = np.diag(Q)[:, None] - np.diag(M)[:, None] * w**2 + 1j * np.diag(P)[:, None] * w
-    p, q, r = diagonal.reshape(2, 3, w.size).swapaxes(0, 1)  # of each plane
-    a, b, c = (Q[[i, i + 3], [j, j + 3], None] for i, j in ((0, 1), (0, 2), (1, 2)))
-    pq, pr, qr = b * c - a * r, a * c - b * q, a * b - c * p
-    cofactors = np.array([[q * r - c**2, pq, pr], [pq, p * r - b**2, qr], [pr, qr, p * q - a**2]])
-    planes = (cofactors * (1 / (p * cofactors[0, 0] + a * pq + b * pr))).transpose(2, 0, 1, 3)
-    columns, tilts, g = planes[:, 2], planes[:, 2, 2], 1j * w * P[2, 5]
-    shared = g / (1 + g**2 * tilts[0] * tilts[1])
-    coupling = (shared * columns[0])[:, None] * columns[1]
-    H = np.empty((w.size, 2, 3, 2, 3), dtype=np.complex128)
-    blocks = H.transpose(1, 3, 2, 4, 0)
-    blocks[0, 0], blocks[1, 1] = planes - ((shared * g * tilts[::-1])[:, None] * columns)[:, :, None] * columns[:, None]
-    blocks[0, 1], blocks[1, 0] = -coupling, coupling.swapaxes(0, 1)
-    return H.reshape(-1, 6, 6)
-
-
-def factor_of(C: FloatArray) -> FloatArray:
-    """Lower triangular T of the positive semidefinite level matrix nearest to C, shape (6, 6)."""
-    values, vectors = np.linalg.eigh(C)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    return np.asarray(np.linalg.qr(root.T)[1].T, dtype=np.float64)
 
 
 def packed(matrices: ComplexArray) -> FloatArray:
@@ -352,7 +353,7 @@ def usual_force(machine: Machine, motions: Motions, groups: BinGroups, speed_rad
     theta = np.zeros(model.size)
     theta[model.cutoff_at], theta[model.order_at] = np.log(cutoff_hz), np.log(2)
     theta[model.noise_at] = -np.inf
-    theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+    theta[model.level_at] = IDENTITY
     explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed_rad_s).S).real / (model.n * groups.bins.sum())
     return float(explained**-0.5)
 

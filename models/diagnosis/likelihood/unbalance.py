@@ -82,21 +82,10 @@ def estimate_unbalance(
     The vector's covariance is the stochastic part's spectrum divided by the window length, averaged around Ω under the
     kernel of a window of that length, plus the effect of the structural parameters' errors on the predicted response.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (5, 5)
-        Of the logarithmic ratios of the structural parameters at the estimate, `point`.
-    synchronous : ndarray of complex, shape (n_states,)
-        q, SI.
-    sized : bool
-        Whether the zero of the vector's angle is unknown, so that only its size counts: it is turned to the heavy spot.
-    backward : bool
-        Whether the shaft turns from z to y although the speed is positive (one found in the vibration always is).
-
-    Raises
-    ------
-    EstimationError
-        If the vector does not determine e.
+    `covariance`, shape (5, 5), is that of the logarithmic ratios of the structural parameters at the estimate, `point`;
+    `synchronous`, shape (n_states,), is q, SI. If `sized`, the zero of its angle is unknown, so that only its size
+    counts: it is turned to the heavy spot. If `backward`, the shaft turns from z to y although the speed is positive
+    (one found in the vibration always is). Raises EstimationError if the vector does not determine e.
     """
     rotor = machine.rotor
     w = np.array([speed_rad_s])
@@ -118,17 +107,13 @@ def estimate_unbalance(
         q, ratio = q * (abs(ratio) / ratio), complex(abs(ratio))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
     own = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
-    turned = 1j * g
-    g2, turned2, q2 = (np.concatenate([part.real, part.imag]) for part in (g, turned, q))
+    q2, g2 = _parts(q), _parts(g)
+    both = np.stack([g2, _parts(1j * g)], axis=1)
     values, variances, with_structural = np.empty(3), np.empty(3), np.empty((3, len(STRUCTURAL)))
-    between = 0.0
-    shifts = np.stack(slopes) * ratio
-    J = np.concatenate([shifts.real, shifts.imag], axis=1).T
-    size = np.maximum(np.abs(q), np.abs(g))
-    apart = _contradiction(q2, np.stack([g2, turned2], axis=1), own + J @ covariance @ J.T, size)
-    for design, at, expected in ((g2[:, None], [0], ratio.real), (np.stack([g2, turned2], axis=1), [1, 2], ratio)):
-        shifts = np.stack(slopes) * expected
-        J = np.concatenate([shifts.real, shifts.imag], axis=1).T
+    J = _parts(np.stack(slopes) * ratio).T
+    apart = _contradiction(q2, both, own + J @ covariance @ J.T, np.maximum(np.abs(q), np.abs(g)))
+    for design, at, expected in ((g2[:, None], [0], ratio.real), (both, [1, 2], ratio)):
+        J = _parts(np.stack(slopes) * expected).T
         total = own + J @ covariance @ J.T + apart
         weight = np.linalg.solve(total, design).T
         precision = weight @ design
@@ -138,13 +123,17 @@ def estimate_unbalance(
         values[at] = spread @ (weight @ q2)
         variances[at] = np.diag(spread)
         with_structural[at] = -spread @ (weight @ J) @ covariance
-        between = float(spread[0, -1])
     foreign = foreign_rotation(q2, design @ values[1:], total - apart)
     if foreign:
         foreign = f"{machine.name}: the 1× vibration is not what an unbalance causes on this rotor: {foreign}"
     weights = np.asarray(weighted.conj() @ combined[0] / total_weight, dtype=np.complex128)
     explained = abs(ratio) ** 2 * total_weight
-    return UnbalanceRatios(values, variances, between, with_structural, foreign, weights, explained)
+    return UnbalanceRatios(values, variances, float(spread[0, 1]), with_structural, foreign, weights, explained)
+
+
+def _parts(vectors: ComplexArray) -> FloatArray:
+    """Real parts, then imaginary parts."""
+    return np.concatenate([vectors.real, vectors.imag], axis=-1)
 
 
 def _contradiction(observed: FloatArray, design: FloatArray, spread: FloatArray, size: FloatArray) -> FloatArray:
@@ -190,11 +179,7 @@ def estimate_unbalance_by_hop(
 
     The hops' own errors are independent; the error of the structural parameters is common to all. If `sized`, the zero
     of each hop's angle is unknown, and so is the sense of rotation: the one that explains more of the vectors is taken.
-
-    Raises
-    ------
-    EstimationError
-        If a vector does not determine e.
+    Raises as `estimate_unbalance`.
     """
     known = machine, model, point, covariance
     ways = [

@@ -4,12 +4,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, suspect_pairs, swapped
-from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
+from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, swapped
+from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair
 from models.diagnosis.sensors.level import CHECKS, clipped, dropped, gain_jump, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
-from models.diagnosis.sensors.reference import Naming, SensorReference, implicated
+from models.diagnosis.sensors.reference import PERFECT, Naming, SensorReference, implicated
 from models.diagnosis.sensors.standstill import runs_down
 from models.diagnosis.window.motion import motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
@@ -37,54 +37,50 @@ def sensor_findings(
     """
     window, naming = window.as_mounted, Naming(channels)
     stood = np.full(len(window.waveforms), True) if standing else runs_down(window)
-    bare = implicated(missing)
-    still = [*stuck(window, naming, stood), *dropped(window, naming)]
-    findings = [*missing, *(found for found in still if not set(found.states) & bare)]
-    lost = implicated(findings)  # a channel that drops to the end of its range is not clipped
-    findings += [found for found in clipped(window, naming) if not set(found.states) & lost]
-    wrong_angle = [] if "theta" in bare else no_angle(window, naming)
+    findings = list(missing)
+
+    def of_others(found: Iterable[SensorFault]) -> list[SensorFault]:
+        bad = implicated(findings)
+        return [one for one in found if bad.isdisjoint(one.states)]
+
+    findings += of_others((*stuck(window, naming, stood), *dropped(window, naming)))
+    findings += of_others(clipped(window, naming))  # a channel that drops to the end of its range is not clipped
+    wrong_angle = [] if "theta" in implicated(missing) else no_angle(window, naming)
     if stood.any() or wrong_angle:
         return (*findings, *wrong_angle)
     for check in CHECKS:
-        bad = implicated(findings)
-        findings += [found for found in check(window, naming, reference) if not set(found.states) & bad]
+        findings += of_others(check(window, naming, reference))
     bad = implicated(findings)
     if any("theta" in one.states and (one.value or 0.0) < _ALL * window.duration_s for one in missing):
         return tuple(findings)  # a hop in which the angle comes or goes keeps its synchronous part
-
-    def sound(*columns: int) -> bool:
-        return not {window.states[column] for column in columns} & bad
-
+    columns = [column for column, state in enumerate(window.states) if state not in bad]
     if "theta" not in bad:
-        columns = [column for column, state in enumerate(window.states) if state not in bad]
         wrong_angle = phase_faults(window, columns, naming, reference)
         if wrong_angle:
             return (*findings, *wrong_angle)
-    bands = {pair: banded(window, pair) for pair in motion_pairs(window.states) if sound(pair.first, pair.second)}
-    exchanged, explained = swapped(window, suspect_pairs(window.states, bands, reference), naming, reference)
+    pairs = [pair for pair in motion_pairs(window.states) if {pair.first, pair.second} <= set(columns)]
+    bands = {pair: Banded(window, pair) for pair in pairs}
+    exchanged, explained = swapped(window, bands, naming, reference)
     findings += exchanged
     readings: list[PairReading] = []
     for pair, own in bands.items():
-        first, second = window.states[pair.first], window.states[pair.second]
-        known = None if reference is None else reference.pair(first, second)
+        states = window.states[pair.first], window.states[pair.second]
+        known = None if reference is None else reference.pair(*states)
         lead_rad_s = None if known is None else known.lead_rad_s
         reading = None if pair in explained else read_pair(window, pair, own, lead_rad_s)
         if reading is None:
             continue
-        if reading.shared >= BROKEN * (1.0 if known is None else known.shared):
+        if reading.shared >= BROKEN * (known or PERFECT).shared:
             readings.append(reading)
-            continue
-        if "theta" in bad:
-            continue  # the synchronous part is still there, and its run-out is in the displacement alone
-        text = (
-            f"{naming.name(second)} and {naming.name(first)} measure the same motion but share only "
-            f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
-        )
-        findings.append(SensorFault(states=(first, second), kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
-    bad = implicated(findings)
-    findings += gain_and_delay(window, readings, bands, naming, reference)
-    findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
+        elif "theta" not in bad:  # or the synchronous part is still there, and its run-out is in the displacement alone
+            text = (
+                f"{naming.name(states[1])} and {naming.name(states[0])} measure the same motion but share only "
+                f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
+            )
+            findings.append(SensorFault(states=states, kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
+    findings += gain_and_delay(window, readings, naming, reference)
+    findings += of_others(gain_jump(window, naming))  # of channels that are in no reading
     bad = implicated(findings)
     if "theta" not in bad:  # the synchronous part that a wrong angle leaves in the spectra looks like noise
-        findings += noisy(window, readings, bands, naming, reference, sound)
+        findings += noisy(window, readings, naming, reference, bad)
     return tuple(findings)

@@ -1,13 +1,12 @@
 """Two sensors of one motion that disagree: wrong gain or delay of one of them, or swapped channels."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, delay_course, gain_courses, same
-from models.diagnosis.sensors.reference import Naming, SensorReference
+from models.diagnosis.sensors.kinematics import Banded, PairReading, delay_course, gain_courses, same
+from models.diagnosis.sensors.reference import PERFECT, Naming, SensorReference
 from models.diagnosis.window.motion import MotionPair, motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -30,31 +29,29 @@ _LEAST_COHERENCE = 0.5  # coherence of bearing and disc across the planes, and h
 _MOST_ERROR = 0.2  # largest standard error of a channel's own change, as part of the disagreement, to name a sensor
 
 
-@dataclass(frozen=True, slots=True)
 class _Departure:
     """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
-    reading: PairReading
-    log_gain: float
-    gain_z: float
-    delay_s: float
-    delay_z: float
-    course: FloatArray
-    course_step: float
-    course_z: float
-    known: bool
-    reversed: bool
+    def __init__(self, window: WindowStatistics, reading: PairReading, reference: SensorReference | None) -> None:
+        known = None if reference is None else reference.pair(reading.first, reading.second)
+        usual = known or PERFECT
+        self.reading, self.known, self.reversed = reading, known is not None, reading.polarity != usual.polarity
+        self.log_gain, self.delay_s = reading.log_gain - usual.log_gain, reading.delay_s - usual.delay_s
+        self.gain_z = abs(self.log_gain) / float(np.hypot(reading.log_gain_error, usual.log_gain_spread))
+        self.delay_z = abs(self.delay_s) / float(np.hypot(reading.delay_error_s, usual.delay_spread_s))
+        courses = gain_courses(window, reading)
+        self.course = courses[0][0]
+        parts = [_largest_part(*one) for one in courses]
+        self.course_step, self.course_z = min(parts, key=lambda part: part[1])
+        if len({part[0] > 0 for part in parts}) > 1:
+            self.course_step, self.course_z = 0.0, 0.0  # the noise of one of the two has changed
 
 
 def gain_and_delay(
-    window: WindowStatistics,
-    readings: list[PairReading],
-    bands: Mapping[MotionPair, Banded],
-    naming: Naming,
-    reference: SensorReference | None,
+    window: WindowStatistics, readings: list[PairReading], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
     """Findings on pairs that see the same motion but differ in gain or delay."""
-    departures = {reading.pair: _departure(window, reading, bands[reading.pair], reference) for reading in readings}
+    departures = {reading.pair: _Departure(window, reading, reference) for reading in readings}
     rate_hz = window.n_samples / window.duration_s
     findings: list[SensorFault] = []
     for departure in departures.values():
@@ -63,38 +60,19 @@ def gain_and_delay(
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
         late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
         if late:  # a delay that changes weakens the mean cross-spectrum, like a loss of gain
-            step_s, z = _largest_part(*delay_course(window, departure.reading, bands[departure.reading.pair]))
+            step_s, z = _largest_part(*delay_course(window, departure.reading))
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
         if steady or moving or departure.reversed:
             findings.append(_gain(window, departure, departures, naming, reference, moving=moving and not steady))
         if not departure.known and abs(departure.reading.lead_rad_s) > MOST_LEAD_RAD_S:
-            findings.append(_lead(window, departure.reading, bands[departure.reading.pair], naming))
+            findings.append(_lead(departure.reading, naming))
         elif late:
-            findings.append(_delay(window, departure, departures, naming, rate_hz))
-    return _once(findings)
-
-
-def _departure(
-    window: WindowStatistics, reading: PairReading, bands: Banded, reference: SensorReference | None
-) -> _Departure:
-    first, second = window.states[reading.pair.first], window.states[reading.pair.second]
-    known = None if reference is None else reference.pair(first, second)
-    gain, delay, polarity = reading.log_gain, reading.delay_s, 1
-    gain_error, delay_error = reading.log_gain_error, reading.delay_error_s
-    if known is not None:
-        gain, delay, polarity = gain - known.log_gain, delay - known.delay_s, known.polarity
-        gain_error = float(np.hypot(gain_error, known.log_gain_spread))
-        delay_error = float(np.hypot(delay_error, known.delay_spread_s))
-    courses = gain_courses(window, reading, bands)
-    parts = [_largest_part(*one) for one in courses]
-    step, z = min(parts, key=lambda part: part[1])
-    if len({part[0] > 0 for part in parts}) > 1:
-        step, z = 0.0, 0.0  # the noise of one of the two has changed
-    return _Departure(
-        reading, gain, abs(gain) / gain_error, delay, abs(delay) / delay_error, courses[0][0], step, z,
-        known is not None, reading.polarity != polarity,
-    )  # fmt: skip
+            findings.append(_delay(departure, departures, naming, rate_hz))
+    best: dict[tuple[tuple[str, ...], str], SensorFault] = {}  # the same of the same channels once, with its largest z
+    for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
+        best.setdefault((finding.states, finding.kind), finding)
+    return list(best.values())
 
 
 def _largest_part(course: FloatArray, error: FloatArray) -> tuple[float, float]:
@@ -123,9 +101,9 @@ def _gain(
     *,
     moving: bool,
 ) -> SensorFault:
-    pair = departure.reading.pair
-    first, second = window.states[pair.first], window.states[pair.second]
-    guilty = _by_chain(departure, departures, FaultKind.GAIN, moving=moving)
+    reading, pair = departure.reading, departure.reading.pair
+    sizes = {one: theirs.course_step if moving else theirs.log_gain for one, theirs in departures.items()}
+    guilty = _by_chain(pair, sizes)
     if guilty is None and departure.course_z > MOST_ERRORS:
         guilty = _by_course(window, departure)
     if guilty is None and not moving:
@@ -135,78 +113,63 @@ def _gain(
     error = abs(size) / z if z > 0 else 0.0
     expected = "as they were on the healthy machine" if departure.known else "the same motion, 0 % apart"
     if departure.reversed:
-        text = f"{naming.name(second)} moves opposite to {naming.name(first)}: one of them is reversed"
-        return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=-2.0, z=z)
+        text = f"{naming.name(reading.second)} moves opposite to {naming.name(reading.first)}: one of them is reversed"
+        return SensorFault(states=(reading.first, reading.second), kind=FaultKind.GAIN, text=text, value=-2.0, z=z)
     if guilty is not None:
-        state = window.states[guilty]
+        state, other = (reading.first, reading.second) if guilty == pair.first else (reading.second, reading.first)
         own = size if guilty == pair.second else float(1 / (1 + size) - 1)
         change = f"changed by {own:+.1%} within the window" if moving else f"is off by {own:+.1%}"
-        other = second if state == first else first
         text = (
             f"{naming.name(state)}: its gain {change} (± {error:.1%}) against {naming.name(other)}, expected {expected}"
         )
         return SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=own, z=z)
     change = f"drifted apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
     text = (
-        f"{naming.name(second)} and {naming.name(first)} {change} (± {error:.1%}) in gain, expected {expected}; "
-        "which of them is wrong cannot be told"
+        f"{naming.name(reading.second)} and {naming.name(reading.first)} {change} (± {error:.1%}) in gain, expected "
+        f"{expected}; which of them is wrong cannot be told"
     )
-    return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=size, z=z)
+    return SensorFault(states=(reading.first, reading.second), kind=FaultKind.GAIN, text=text, value=size, z=z)
 
 
 def _delay(
-    window: WindowStatistics,
-    departure: _Departure,
-    departures: dict[MotionPair, _Departure],
-    naming: Naming,
-    rate_hz: float,
+    departure: _Departure, departures: dict[MotionPair, _Departure], naming: Naming, rate_hz: float
 ) -> SensorFault:
-    pair, delay = departure.reading.pair, departure.delay_s
-    guilty = _by_chain(departure, departures, FaultKind.DELAY, moving=False)
-    if guilty is None:  # sensors come late, not early
-        guilty = pair.second if delay > 0 else pair.first
-    other = pair.first if guilty == pair.second else pair.second
-    state, late = window.states[guilty], abs(delay)
+    reading, late = departure.reading, abs(departure.delay_s)
+    guilty = _by_chain(reading.pair, {pair: theirs.delay_s for pair, theirs in departures.items()})
+    # If that does not tell: sensors come late, not early.
+    second_is_late = departure.delay_s > 0 if guilty is None else guilty == reading.pair.second
+    state, other = (reading.second, reading.first) if second_is_late else (reading.first, reading.second)
     expected = "the delay it had on the healthy machine" if departure.known else "both at the same time"
     text = (
         f"{naming.name(state)}: comes {1e3 * late:.3g} ms ({late * rate_hz:.2g} samples, ± "
-        f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
+        f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(other)}, expected {expected}"
     )
     if not departure.known:
         text += "; if its signal comes late by that, or the other is sampled later, state it as delay_us"
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=late, z=departure.delay_z)
 
 
-def _lead(window: WindowStatistics, reading: PairReading, bands: Banded, naming: Naming) -> SensorFault:
+def _lead(reading: PairReading, naming: Naming) -> SensorFault:
     """Finding on a sensor that leads as behind a high-pass; its value is the lead in s, weighted with the power."""
-    pair, power = reading.pair, bands.spectra[:, 1, 1].real
-    guilty, other = (pair.second, pair.first) if reading.lead_rad_s > 0 else (pair.first, pair.second)
-    state, lead_rad_s = window.states[guilty], abs(reading.lead_rad_s)
+    power, lead_rad_s = reading.bands.spectra[:, 1, 1].real, abs(reading.lead_rad_s)
+    state, other = (reading.second, reading.first) if reading.lead_rad_s > 0 else (reading.first, reading.second)
     text = (
-        f"{naming.name(state)}: runs ahead of {naming.name(window.states[other])} as behind a first-order high-pass at "
+        f"{naming.name(state)}: runs ahead of {naming.name(other)} as behind a first-order high-pass at "
         f"{lead_rad_s / (2 * np.pi):.2g} Hz (AC coupling), expected at most {MOST_LEAD_RAD_S / (2 * np.pi):.2g} Hz: "
         "state corner and order of its data sheet as high_pass_hz and high_pass_order, couple both alike, or leave "
         "one of them out"
     )
-    value = lead_rad_s * float(power @ bands.w**-2.0 / power.sum())
+    value = lead_rad_s * float(power @ reading.bands.w**-2.0 / power.sum())
     return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=value)
 
 
-def _by_chain(
-    departure: _Departure, departures: dict[MotionPair, _Departure], kind: FaultKind, *, moving: bool
-) -> int | None:
-    """Faulty column of three sensors of one motion: the one that disagrees while the other two agree."""
-    pair = departure.reading.pair
-    for other, theirs in departures.items():
+def _by_chain(pair: MotionPair, sizes: Mapping[MotionPair, float]) -> int | None:
+    """Faulty column of three sensors of one motion: the one that disagrees (by these sizes) while the others agree."""
+    mine = sizes[pair]
+    for other, his in sizes.items():
         if other == pair or not {other.first, other.second} & {pair.first, pair.second}:
             continue
         (middle,) = {other.first, other.second} & {pair.first, pair.second}
-        if kind == FaultKind.DELAY:
-            mine, his = departure.delay_s, theirs.delay_s
-        elif moving:
-            mine, his = departure.course_step, theirs.course_step
-        else:
-            mine, his = departure.log_gain, theirs.log_gain
         if abs(his) < _MATCH_TOLERANCE * abs(mine):
             return pair.first if middle == pair.second else pair.second
         if abs(his + mine) < _MATCH_TOLERANCE * abs(mine):
@@ -232,7 +195,7 @@ def _by_level(window: WindowStatistics, departure: _Departure, reference: Sensor
         errors.append(float(np.hypot(sizes.std() / seen / np.sqrt(sizes.size), then)))
     if max(errors) > _MOST_ERROR * abs(departure.log_gain):
         return None
-    return _explaining_channel(departure, changes, departure.log_gain)
+    return _explaining_channel(departure.reading.pair, changes, departure.log_gain)
 
 
 def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
@@ -257,24 +220,14 @@ def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
         error = float(np.sqrt((left**2).sum(axis=0).min() / max(1, course.size - 2) / power))
         if error < least:
             best, least = [float(slope) for slope in slopes], error
-    return None if best is None else _explaining_channel(departure, best, 1.0)
+    return None if best is None else _explaining_channel(pair, best, 1.0)
 
 
-def _explaining_channel(departure: _Departure, changes: list[float], size: float) -> int | None:
-    first, second = changes
-    if abs(first) < _MATCH_TOLERANCE * abs(size) and abs(second - size) < _MATCH_TOLERANCE * abs(size):
-        return departure.reading.pair.second
-    if abs(second) < _MATCH_TOLERANCE * abs(size) and abs(first + size) < _MATCH_TOLERANCE * abs(size):
-        return departure.reading.pair.first
-    return None
-
-
-def _once(findings: list[SensorFault]) -> list[SensorFault]:
-    """Each fault of the same channels once, as found with the largest z."""
-    best: dict[tuple[tuple[str, ...], str], SensorFault] = {}
-    for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
-        best.setdefault((finding.states, finding.kind), finding)
-    return list(best.values())
+def _explaining_channel(pair: MotionPair, changes: list[float], size: float) -> int | None:
+    (first, second), most = changes, _MATCH_TOLERANCE * abs(size)
+    if abs(first) < most and abs(second - size) < most:
+        return pair.second
+    return pair.first if abs(second) < most and abs(first + size) < most else None
 
 
 BROKEN = 0.9  # two sensors of one motion that share less than this do not see the same motion
@@ -285,36 +238,28 @@ _LEAST_IMPROVEMENT = 5.0  # factor by which the exchange must reduce the part th
 _CROSSED = 0.25
 
 
-def _healthy_shared(reference: SensorReference | None, first: str, second: str) -> float:
-    known = None if reference is None else reference.pair(first, second)
-    return 1.0 if known is None else known.same
-
-
-def suspect_pairs(
-    states: tuple[str, ...], bands: Mapping[MotionPair, Banded], reference: SensorReference | None
-) -> list[MotionPair]:
-    """Pairs that share too little of their motion, at equal time and size, to be two sensors of one motion."""
-    return [
-        pair
-        for pair, own in bands.items()
-        if same(own) < _SUSPECT * _healthy_shared(reference, states[pair.first], states[pair.second])
-    ]
-
-
 def swapped(
-    window: WindowStatistics, broken: list[MotionPair], naming: Naming, reference: SensorReference | None
+    window: WindowStatistics, bands: Mapping[MotionPair, Banded], naming: Naming, reference: SensorReference | None
 ) -> tuple[list[SensorFault], set[MotionPair]]:
-    """Find exchanges of two channels of one quantity that restore broken pairs; return them and the explained pairs."""
+    """Find exchanges of two channels of one quantity that restore broken pairs; return them and the explained pairs.
+
+    Those pairs are broken that share too little of their motion, at equal time and size, to be two sensors of one.
+    """
+
+    def healthy(pair: MotionPair) -> float:
+        known = None if reference is None else reference.pair(window.states[pair.first], window.states[pair.second])
+        return (known or PERFECT).same
+
+    broken = [pair for pair, own in bands.items() if same(own) < _SUSPECT * healthy(pair)]
     findings: list[SensorFault] = []
     explained: set[MotionPair] = set()
     for one, other in combinations(broken, 2):
         if one.order != other.order or {one, other} & explained:
             continue
         crossed = (MotionPair(one.first, other.second, one.order), MotionPair(other.first, one.second, one.order))
-        now = min(same(banded(window, pair)) for pair in (one, other))
-        then = min(same(banded(window, pair)) for pair in crossed)
-        usual = min(_healthy_shared(reference, window.states[p.first], window.states[p.second]) for p in (one, other))
-        if then < _RESTORED * min(usual, 1.0) or 1 - now < _LEAST_IMPROVEMENT * (1 - then):
+        now = min(same(bands[pair]) for pair in (one, other))
+        then = min(same(Banded(window, pair)) for pair in crossed)
+        if then < _RESTORED * min(healthy(one), healthy(other)) or 1 - now < _LEAST_IMPROVEMENT * (1 - then):
             continue
         explained |= {one, other}
         sides = [(one.first, other.first), (one.second, other.second)]
@@ -324,11 +269,9 @@ def swapped(
         pairs = " and ".join(
             f"{naming.name(window.states[p.first])} moves like {naming.name(window.states[p.second])}" for p in crossed
         )
-        either = (
-            f"{naming.names(states)} are swapped"
-            if guilty is not None
-            else f"{naming.names(states[:2])} are swapped, or {naming.names(states[2:])}"
-        )
+        either = f"{naming.names(states[:2])} are swapped"
+        if guilty is None:
+            either += f", or {naming.names(states[2:])}"
         text = f"{either}: {pairs}, but not as they are connected (shared {then:.3f} crossed, {now:.3f} as connected)"
         findings.append(SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=now))
     return findings, explained
@@ -385,7 +328,7 @@ def _exchanged_side(
 def _agrees(window: WindowStatistics, side: int, column: int) -> bool:
     """Whether a column still agrees with a third sensor of its motion, on the side away from the broken pair."""
     pairs = [pair for pair in motion_pairs(window.states) if column == (pair.first if side else pair.second)]
-    return any(same(banded(window, pair)) > _RESTORED for pair in pairs)
+    return any(same(Banded(window, pair)) > _RESTORED for pair in pairs)
 
 
 def _exchanged(window: WindowStatistics, sizes: FloatArray, side: tuple[int, int], reference: SensorReference) -> bool:

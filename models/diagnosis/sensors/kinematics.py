@@ -34,11 +34,52 @@ _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann s
 _FLOOR = 1e-10
 
 
+class Banded:
+    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
+
+    def __init__(self, window: WindowStatistics, pair: MotionPair) -> None:
+        w = 2 * np.pi * window.frequencies_hz
+        columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
+        edges = pair_bands(w.size)
+        counts = np.diff(np.append(edges, w.size))
+        turn = (1j * w) ** pair.order
+        turned = window.spectrum[:, pair.first, columns] * turn[:, None]
+        turned[:, 0] *= turn.conj()
+        own = window.spectrum[:, pair.second, pair.second].real
+        power = own + _FLOOR * own.max() + np.finfo(float).tiny
+        # (n_bands,), angular frequency at the centroid of each band's power
+        self.w: FloatArray = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
+        step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+        # (n_bands,), number of effectively independent samples
+        self.averages: FloatArray = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
+        # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
+        self.spectra = window.banded_spectrum[:, columns[:, None], columns]
+        self.spectra[:, 0] = np.add.reduceat(turned, edges)
+        self.spectra[:, 1:, 0] = self.spectra[:, 0, 1:].conj()
+        self.spectra /= counts[:, None, None]
+        self.total = self.spectra[:, :2, :2].copy()  # (n_bands, 2, 2), including the synchronous part
+        # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without vectors
+        self.rotation: tuple[float, ComplexArray] | None = None
+        vectors, speeds = window.rotation_vectors, window.hop_speed_rad_s
+        if vectors is not None:
+            known = np.isfinite(speeds)
+            z = vectors[:, pair.first] * (1j * speeds) ** pair.order
+            both, speed = np.stack([z, vectors[:, pair.second]], axis=1)[known], float(np.mean(speeds[known]))
+            near = int(np.searchsorted(w[edges], speed, side="right")) - 1
+            if near >= 0 and speed <= w[-1]:
+                line = both.T @ both.conj() / len(both)
+                self.total[near] += line / (4 * counts[near] * step_hz)
+            self.rotation = speed, both
+
+
 @dataclass(frozen=True, slots=True)
 class PairReading:
     """Gain and delay of the second sensor of a motion relative to the first."""
 
     pair: MotionPair
+    first: str  # states of the pair
+    second: str
+    bands: Banded
     # Logarithm of the second's gain over the first's, and its standard error.
     log_gain: float
     log_gain_error: float
@@ -46,78 +87,22 @@ class PairReading:
     # Delay of the second, and its standard error.
     delay_s: float
     delay_error_s: float
+    shared: float  # coherent part of the motion after matching gain and delay, 0 to 1, over the whole band
     # Additional phase lead of the second times the angular frequency; 0 unless that explains the phases and a delay
     # does not. For a first-order high-pass this is the corner frequency.
-    lead_rad_s: float
-    shared: float  # coherent part of the motion after matching gain and delay, 0 to 1, over the whole band
+    lead_rad_s: float = 0.0
 
-    def transfer(self, w: FloatArray) -> ComplexArray:
-        """Transfer function from z to v at angular frequencies `w`."""
-        phase = self.lead_rad_s / w - w * self.delay_s
+    @property
+    def transfer(self) -> ComplexArray:
+        """Transfer function from z to v in each band."""
+        phase = self.lead_rad_s / self.bands.w - self.bands.w * self.delay_s
         return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
-
-
-@dataclass(frozen=True, slots=True)
-class Banded:
-    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
-
-    # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
-    spectra: ComplexArray
-    total: ComplexArray  # (n_bands, 2, 2), the same for z and v, including the synchronous part
-    w: FloatArray  # (n_bands,), angular frequency at the centroid of each band's power
-    averages: FloatArray  # (n_bands,), number of effectively independent samples
-    # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without 1x vectors
-    rotation: tuple[float, ComplexArray] | None
-
-
-def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
-    """Average the window's spectra over bands, with the first channel differentiated to the second's quantity."""
-    w = 2 * np.pi * window.frequencies_hz
-    columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
-    edges = pair_bands(w.size)
-    counts = np.diff(np.append(edges, w.size))
-    turn = (1j * w) ** pair.order
-    turned = window.spectrum[:, pair.first, columns] * turn[:, None]
-    turned[:, 0] *= turn.conj()
-    own = window.spectrum[:, pair.second, pair.second].real
-    power = own + _FLOOR * own.max() + np.finfo(float).tiny
-    centre = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
-    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
-    averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
-    spectra = window.banded_spectrum[:, columns[:, None], columns]
-    spectra[:, 0] = np.add.reduceat(turned, edges)
-    spectra[:, 1:, 0] = spectra[:, 0, 1:].conj()
-    spectra /= counts[:, None, None]
-    total = spectra[:, :2, :2].copy()
-    rotation = _rotation(window, pair)
-    if rotation is not None:
-        speed, vectors = rotation
-        near = int(np.searchsorted(w[edges], speed, side="right")) - 1
-        if near >= 0 and speed <= w[-1]:
-            line = vectors.T @ vectors.conj() / len(vectors)
-            total[near] += line / (4 * counts[near] * step_hz)
-    return Banded(spectra, total, centre, averages, rotation)
-
-
-def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, ComplexArray] | None:
-    """Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2)."""
-    vectors = window.rotation_vectors
-    if vectors is None:
-        return None
-    W = window.hop_speed_rad_s
-    known = np.isfinite(W)
-    z = vectors[:, pair.first] * (1j * W) ** pair.order
-    both = np.stack([z, vectors[:, pair.second]], axis=1)[known]
-    return float(np.mean(W[known])), both
 
 
 def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
     """First column of each place other than the pair's."""
-    own = states[pair.first].partition("_")[0]
-    first: dict[str, int] = {}
-    for column, name in enumerate(states):
-        first.setdefault(name.partition("_")[0], column)
-    return [column for place, column in first.items() if place != own]
+    places = [name.partition("_")[0] for name in states]
+    return [places.index(place) for place in dict.fromkeys(places) if place != places[pair.first]]
 
 
 def same(bands: Banded) -> float:
@@ -147,13 +132,12 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 
 
 def read_pair(
-    window: WindowStatistics, pair: MotionPair, bands: Banded | None = None, lead_rad_s: float | None = None
+    window: WindowStatistics, pair: MotionPair, bands: Banded, lead_rad_s: float | None = None
 ) -> PairReading | None:
-    """Compare two sensors of one motion, from given `banded` spectra or new ones; None if either does not fluctuate.
+    """Compare two sensors of one motion, from their banded spectra; None if either does not fluctuate.
 
     `lead_rad_s` is the lead of the healthy pair; if None, it is estimated from the window.
     """
-    bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
     if not (np.all(z > 0) and np.all(v > 0)):
         return None
@@ -162,28 +146,27 @@ def read_pair(
     level, other, cross = _powers_over_frequency(bands)
     delay_s, total = _turned(bands.w, cross)
     polarity, log_gain = 1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR)))
-    fitted = partial(_fitted, PairReading(pair, log_gain, 0.0, polarity, delay_s, 0.0, 0.0, 0.0))
     shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
+    states = window.states[pair.first], window.states[pair.second]
+    fitted = partial(_fitted, PairReading(pair, *states, bands, log_gain, 0.0, polarity, delay_s, 0.0, shared))
     alone = fitted(bands.w, h, variance, bias)
-    across = _across(alone, _other_plane(window, pair, bands), bands.w, h, variance)
+    across = _across(alone, _other_plane(window, pair, bands), h, variance)
     if across is not None:
         h = h - across
         alone = fitted(bands.w, h, variance, bias)
-    lead_rad_s = _lead(alone, bands.w, h, variance) if lead_rad_s is None else lead_rad_s
+    lead_rad_s = _lead(alone, h, variance) if lead_rad_s is None else lead_rad_s
     if lead_rad_s:
         h = h * np.exp(-1j * lead_rad_s / bands.w)
         alone = fitted(bands.w, h, variance, bias)
-    line = None if bands.rotation is None else _transfer_at_1x(bands.rotation, window, bands, incoherent)
+    line = _transfer_at_1x(window, bands, incoherent)
     if line is None:
-        return replace(alone, lead_rad_s=lead_rad_s, shared=shared)
+        return replace(alone, lead_rad_s=lead_rad_s)
     speed, ratio, spread = line
     ratio *= complex(np.exp(-1j * lead_rad_s / speed))
     found = fitted(np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0))
     foreign = abs(found.log_gain - alone.log_gain) > max(_MOST_LINE_ERRORS * alone.log_gain_error, _RUNOUT)
     foreign |= abs(found.delay_s - alone.delay_s) > _MOST_LINE_ERRORS * alone.delay_error_s
-    if foreign and alone.log_gain_error < _RUNOUT:
-        found = alone
-    return replace(found, lead_rad_s=lead_rad_s, shared=shared)
+    return replace(alone if foreign and alone.log_gain_error < _RUNOUT else found, lead_rad_s=lead_rad_s)
 
 
 def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray) -> PairReading:
@@ -200,7 +183,7 @@ def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatA
     scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
     gain_error = math.sqrt(scatter_gain / (2 * total)) + float(weight @ bias) / total
     delay_error_s = math.sqrt(scatter_delay / (2 * moment))
-    return PairReading(start.pair, log_gain, gain_error, start.polarity, delay_s, delay_error_s, 0.0, 0.0)
+    return replace(start, log_gain=log_gain, log_gain_error=gain_error, delay_s=delay_s, delay_error_s=delay_error_s)
 
 
 def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> ComplexArray | None:
@@ -217,7 +200,7 @@ def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> C
 
 
 def _across(
-    alone: PairReading, other: ComplexArray | None, w: FloatArray, h: ComplexArray, variance: FloatArray
+    alone: PairReading, other: ComplexArray | None, h: ComplexArray, variance: FloatArray
 ) -> ComplexArray | None:
     """Contribution of the other plane to the transfer function; None unless it fits beyond gain, delay and lead.
 
@@ -227,7 +210,7 @@ def _across(
     """
     if other is None or not other.any():  # a stuck sensor of the other plane gives zeros
         return None
-    expected = alone.transfer(w)
+    w, expected = alone.bands.w, alone.transfer
     aim, seen = h / expected - 1, other / expected
     weight = np.tile(np.sqrt(2 / variance), 2)
     sides = [np.ones_like(h), 1j * w, 1j / w, seen]
@@ -243,21 +226,23 @@ def _across(
     return np.asarray(size * other, dtype=np.complex128) if abs(size) < _MOST_ACROSS else None
 
 
-def _lead(alone: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray) -> float:
+def _lead(alone: PairReading, h: ComplexArray, variance: FloatArray) -> float:
     """Phase lead of the second times w; 0 unless it explains the phases of all bands better than a delay."""
-    weight, ahead = 2 / variance, np.angle(alone.polarity * h)
+    w, weight, ahead = alone.bands.w, 2 / variance, np.angle(alone.polarity * h)
     lead_rad_s = float(weight @ (ahead / w) / (weight @ w**-2.0))
-    late = np.angle(h / alone.transfer(w))
+    late = np.angle(h / alone.transfer)
     as_delay, as_lead = (float(weight @ left**2) for left in (late, ahead - lead_rad_s / w))
     scatter = max(1.0, as_lead / max(1, w.size - 1))
     return lead_rad_s if as_delay - as_lead > _TOLD_APART * scatter else 0.0
 
 
 def _transfer_at_1x(
-    rotation: tuple[float, ComplexArray], window: WindowStatistics, bands: Banded, incoherent: FloatArray
+    window: WindowStatistics, bands: Banded, incoherent: FloatArray
 ) -> tuple[float, complex, float] | None:
     """Speed, and transfer at 1x with its relative variance, from the 1x vectors; None if z has no 1x power."""
-    speed, vectors = rotation
+    if bands.rotation is None:
+        return None
+    speed, vectors = bands.rotation
     power = float(np.sum(np.abs(vectors[:, 0]) ** 2))
     if not (power > 0 and np.isfinite(power)):
         return None
@@ -289,9 +274,7 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     return h, variance / explained, left
 
 
-def gain_courses(
-    window: WindowStatistics, reading: PairReading, bands: Banded
-) -> tuple[tuple[FloatArray, FloatArray], ...]:
+def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[FloatArray, FloatArray], ...]:
     """Relative deviation of the pair's gain from its median, hop by hop, and each hop's standard error, in two ways.
 
     Sensor noise is constant while the motion varies: its share of the signal grows as a machine runs down and shrinks
@@ -301,10 +284,10 @@ def gain_courses(
     The first way divides the cross-power by the power of the first sensor, so noise of the first lowers it; the second
     way divides by the power of the second. A change of gain shows in both, a change of one sensor's noise in one.
     """
-    number = motion_pairs(window.states).index(reading.pair)
+    bands, number = reading.bands, motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
-    aligned = reading.transfer(bands.w).conj() / np.exp(reading.log_gain)
+    aligned = reading.transfer.conj() / np.exp(reading.log_gain)
     powers = np.stack([hop[number] for hop in window.pair_powers])
     common = np.real(aligned * powers[:, :, 1])
     averages = bands.averages / len(powers)
@@ -331,11 +314,11 @@ def _course(
     return np.asarray(np.sum(course * weight, axis=1) / total, dtype=np.float64), np.asarray(error, dtype=np.float64)
 
 
-def delay_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, FloatArray]:
+def delay_course(window: WindowStatistics, reading: PairReading) -> tuple[FloatArray, FloatArray]:
     """Delay of the second beyond that of the reading, hop by hop, and the standard error of each hop, s."""
-    number = motion_pairs(window.states).index(reading.pair)
+    bands, number = reading.bands, motion_pairs(window.states).index(reading.pair)
     powers = np.stack([hop[number] for hop in window.pair_powers])
-    common = powers[:, :, 1] * reading.transfer(bands.w).conj()
+    common = powers[:, :, 1] * reading.transfer.conj()
     coherent = np.abs(common) ** 2 / np.maximum(powers[:, :, 0].real * powers[:, :, 2].real, np.finfo(float).tiny)
     weight = coherent / np.maximum(1 - coherent, _FLOOR) * bands.w**2 * bands.averages / len(powers)
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)  # avoid 0 / 0 in a hop with a dead sensor

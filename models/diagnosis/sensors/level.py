@@ -7,7 +7,7 @@ that other channels share, cannot be distinguished from a change of the machine 
 """
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +41,12 @@ _FEWEST_DROPPED = 3  # least number of hops with drop-outs for a finding; fewer 
 _SHAFT_PART = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
 
 
-def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> list[SensorFault]:
+def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> Iterator[SensorFault]:
     """Channels that hold a value or show nothing but their quantisation, and a shaft angle that does not turn.
 
     The angle need not turn in the hops of `stood`, shape (n_hops,), in which the machine stood or was running down.
     """
-    hops, findings = window.hop_waveform, []
+    hops = window.hop_waveform
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
     limit = max(3, min(round(STILL_S * rate_hz), hops.n_samples))
     for column, state in enumerate(window.sensors):
@@ -77,13 +77,12 @@ def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]
                 f"{name}: repeated {what} for {lost_s:.3g} s, "
                 f"expected to change within {STILL_S:g} s: the sensor or its line is stuck"
             )
-        findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s))
-    return findings
+        yield SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s)
 
 
-def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+def dropped(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]:
     """Channels that jump to a constant and back in several hops, beyond the steps of a coarse converter."""
-    hops, findings = window.hop_waveform, []
+    hops = window.hop_waveform
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
     for column, state in enumerate(window.sensors):
         counts = hops.dropped[:, column]
@@ -93,13 +92,12 @@ def dropped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
                 f"{naming.name(state)}: jumps to a constant and back, for {lost_s:.2g} s of {window.duration_s:.3g} s, "
                 "expected an unbroken signal: a loose connector or a broken cable"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s))
-    return findings
+            yield SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s)
 
 
-def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+def clipped(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]:
     """Clipped channels: more samples lie exactly at a hop's extreme than even in a quantised sine."""
-    hops, findings = window.hop_waveform, []
+    hops = window.hop_waveform
     swing = (hops.maximum - hops.minimum) / 2
     step = np.where(np.isnan(hops.step), 0.0, hops.step)
     sine = np.sqrt(2 * step / np.where(swing > 0, swing, np.inf)) / np.pi
@@ -123,8 +121,7 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
                 f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples lie exactly there, "
                 f"expected less than {float(allowed[:, column].max()):.1%}: the measuring range is too small"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.CLIPPED, text=text, value=flat))
-    return findings
+            yield SensorFault(states=(state,), kind=FaultKind.CLIPPED, text=text, value=flat)
 
 
 def at_range_end(windows: Sequence[WindowStatistics], naming: Naming, faulty: Collection[str] = ()) -> list[str]:
@@ -148,9 +145,9 @@ def at_range_end(windows: Sequence[WindowStatistics], naming: Naming, faulty: Co
     return found
 
 
-def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) -> list[SensorFault]:
+def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) -> Iterator[SensorFault]:
     """Displacements with peaks that the velocity or acceleration of the same motion does not show: no real motion."""
-    hops, found = window.hop_waveform, []
+    hops = window.hop_waveform
     reach = np.maximum(hops.maximum - hops.mean, hops.mean - hops.minimum)
     crest = reach / np.where(hops.rms > 0, hops.rms, np.inf)
     for pair in motion_pairs(window.states):
@@ -163,24 +160,21 @@ def spiked(window: WindowStatistics, naming: Naming, _: SensorReference | None) 
             f"{np.count_nonzero(alone)} of {len(alone)} hops, which {naming.name(second)} does not show: a loose "
             "connector, or a bad cable"
         )
-        found.append(SensorFault(states=(first,), kind=FaultKind.INCOHERENT, text=text, value=None))
-    return found
+        yield SensorFault(states=(first,), kind=FaultKind.INCOHERENT, text=text, value=None)
 
 
-def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFault]:
+def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> Iterator[SensorFault]:
     """Channels whose mean steps or drifts within the window, or differs from that in the reference."""
     means = window.hop_waveform.mean[:, : len(window.states)]
-    rms, spread = _scale(window), _spread(window)
+    # The median over the hops, so that a step within one does not raise the limit.
+    rms, spread = np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), _spread(window)
     steps, drifts = _largest_step(means), means[-1] - means[0]
-    moved = np.full(len(window.states), np.nan)
-    floor = np.zeros(len(window.states))
-    if reference is not None:
-        for column, state in enumerate(window.states):
-            known = reference.channel(state)
-            if known is not None:
-                moved[column] = means[:, column].mean() - known.mean
-                floor[column] = max(STEP_SPREADS * max(known.mean_spread, spread[column]), MOVED_PART * known.rms)
-    findings = []
+    moved, floor = np.full(len(window.states), np.nan), np.zeros(len(window.states))
+    for column, state in enumerate(window.states):
+        known = None if reference is None else reference.channel(state)
+        if known is not None:
+            moved[column] = means[:, column].mean() - known.mean
+            floor[column] = max(STEP_SPREADS * max(known.mean_spread, spread[column]), MOVED_PART * known.rms)
     for column, state in enumerate(window.states):
         name, own = naming.name(state), float(rms[column])
         if not own > 0:  # `stuck` reports it
@@ -210,25 +204,17 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
             )
         else:
             continue
-        findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z))
-    return findings
+        yield SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z)
 
 
 CHECKS = (offset, spiked)
 """Checks of channels that are neither missing, stuck nor clipped, in their order."""
 
 
-def _scale(window: WindowStatistics) -> FloatArray:
-    """Median over the hops of each channel's rms, so that a step within one hop does not raise the limit."""
-    return np.asarray(np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), dtype=np.float64)
-
-
 def _spread(window: WindowStatistics) -> FloatArray:
     """Robust standard deviation of a hop's mean from hop to hop, at least that which the lowest bins predict."""
-    hops = window.hop_waveform
-    n, count = len(window.states), len(window.waveforms)
-    means = hops.mean[:, :n]
-    between = np.zeros(n)
+    means, count = window.hop_waveform.mean[:, : len(window.states)], len(window.waveforms)
+    between = np.zeros(len(window.states))
     if count > 3:
         steps = np.diff(means, axis=0)
         between = 1.4826 * np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) / np.sqrt(2)
@@ -247,12 +233,9 @@ def _largest_step(means: FloatArray) -> FloatArray:
 
 def _shaft_moved(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     """Whether a displacement's mean changed together with another displacement's, as when the shaft moves."""
-    places = [
-        i for i, name in enumerate(states) if name in ("y1", "y2", "z1", "z2") or re.fullmatch(r"\w+@[\d.]+", name)
-    ]
-    if column not in places:
-        return False
-    return any(abs(changes[i]) > _SHAFT_PART * abs(changes[column]) for i in places if i != column)
+    places = [at for at, name in enumerate(states) if re.fullmatch(r"[yz][12]|\w+@[\d.]+", name)]
+    others = [at for at in places if at != column] if column in places else []
+    return any(abs(changes[at]) > _SHAFT_PART * abs(changes[column]) for at in others)
 
 
 MOST_ERRORS = 6.0  # standard errors that a jump must exceed, tested at the most probable of all moments
@@ -261,16 +244,15 @@ LEAST_JUMP = 0.08
 _FEWEST_SIDE = 3
 
 
-def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
+def gain_jump(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]:
     """Find channels without a second sensor of their motion whose gain jumped within the window."""
     vectors, n = window.rotation_vectors, len(window.states)
     paired = {column for pair in motion_pairs(window.states) for column in (pair.first, pair.second)}
     if vectors is None or n < 3 or vectors.shape[0] < 2 * _FEWEST_SIDE + 2 or not np.all(np.abs(vectors) > 0):
-        return []
+        return
     length, angle = np.log(np.abs(vectors)), np.unwrap(np.angle(vectors), axis=0)
     angle = angle - np.median(angle, axis=1, keepdims=True)  # without a phase reference each hop has its own zero
     level = np.log(np.maximum(window.hop_waveform.rms[:, :n], np.finfo(float).tiny))
-    findings = []
     for column in range(n):
         if column in paired:
             continue
@@ -295,8 +277,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "
                 f"{why}"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=value, z=z))
-    return findings
+            yield SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=value, z=z)
 
 
 def _moment(series: FloatArray) -> int:

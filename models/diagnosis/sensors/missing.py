@@ -35,13 +35,7 @@ def no_data(names: Sequence[str]) -> str:
 
 
 class MissingNumbers:
-    """Remembers when channels had no numbers.
-
-    Parameters
-    ----------
-    channels : sequence of Channel
-        The machine's channels in the order of a block's columns.
-    """
+    """Remembers when channels, given in the order of a block's columns, had no numbers."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._states, self._naming = [state_name(channel) for channel in channels], Naming(channels)
@@ -82,12 +76,6 @@ class MissingNumbers:
         return {"times_ns": self._times_ns}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Restore the state that `checkpoint` returned.
-
-        Raises
-        ------
-        CheckpointError
-            If the array is missing, or has another type or shape.
-        """
+        """Restore the state that `checkpoint` returned."""
         self._times_ns = checked(arrays, "times_ns", np.int64, self._times_ns.shape).copy()
         self._newest_ns = int(self._times_ns.max(initial=-1))

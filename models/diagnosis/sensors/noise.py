@@ -6,24 +6,14 @@ and of its share of the vibration, less the median rise of the other channels. T
 matter: the diagnosis allows for noise, and a finding would stop it needlessly.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading
-from models.diagnosis.sensors.reference import (
-    ChannelNoise,
-    Naming,
-    SensorReference,
-    channel_noise,
-    channel_rms,
-    floor,
-    matched,
-    pair_noise,
-    single,
-)
-from models.diagnosis.window.motion import MotionPair
+from models.diagnosis.sensors.kinematics import PairReading
+from models.diagnosis.sensors.reference import Naming, PairNoise, SensorReference, channel_noise, channel_rms, floor
+from models.diagnosis.window.excluded import MAINS_HZ
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
@@ -47,7 +37,6 @@ FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's ow
 LINE_RISE = 4.0
 # Least rms of the noise over that of the channel to be reported: as seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
-_MAINS_HZ = (50.0, 60.0)
 _MAINS_OFF_HZ = 0.2  # largest deviation of the mains frequency (EN 50160 allows 1 % in 99.5 % of a year)
 _FEWEST = 4  # least number of channels needed to see that one of them rose alone
 # Calibrated standard deviations of the logarithm of a healthy pair's rise, and of that of a healthy channel's floor.
@@ -69,52 +58,45 @@ def _alone(rise: FloatArray) -> FloatArray:
 def noisy(
     window: WindowStatistics,
     readings: Sequence[PairReading],
-    bands: Mapping[MotionPair, Banded],
     naming: Naming,
     reference: SensorReference | None,
-    sound: Callable[..., bool],
+    bad: Set[str],
 ) -> list[SensorFault]:
     """Findings on channels with more noise than on the healthy machine; none without a reference.
 
-    The readings are those of pairs that see the same motion; `sound` returns whether columns have no other fault.
+    The readings are those of pairs that see the same motion; `bad` are states with other faults.
     """
     if reference is None:
         return []
-    findings = _of_pairs(
-        window, [one for one in readings if sound(one.pair.first, one.pair.second)], bands, naming, reference
-    )
-    columns = single(window.states)
-    if not findings and sound(*range(len(window.states))):
-        findings += _of_single(window, channel_noise(window, columns), naming, reference)
+    sound = [one for one in readings if one.first not in bad and one.second not in bad]
+    findings = list(_of_pairs(window, sound, naming, reference))
+    if not findings and bad.isdisjoint(window.states):
+        findings += _of_single(window, naming, reference)
     return findings
 
 
 def _of_pairs(
-    window: WindowStatistics,
-    readings: Sequence[PairReading],
-    bands: Mapping[MotionPair, Banded],
-    naming: Naming,
-    reference: SensorReference,
-) -> list[SensorFault]:
+    window: WindowStatistics, readings: Sequence[PairReading], naming: Naming, reference: SensorReference
+) -> Iterator[SensorFault]:
     known = []
     for reading in readings:
-        then = reference.pair(window.states[reading.pair.first], window.states[reading.pair.second])
+        then = reference.pair(reading.first, reading.second)
         healthy = None if then is None else then.noise
-        if healthy is not None and len(healthy.density) == bands[reading.pair].w.size:
-            known.append((reading, pair_noise(window, bands[reading.pair], reading), healthy))
+        if healthy is not None and len(healthy.density) == reading.bands.w.size:
+            known.append((reading, PairNoise(window, reading), healthy))
     if not known:
-        return []
+        return
     absolute = np.log([now.density / (np.array(then.density) + now.leakage) for _, now, then in known])
     relative = np.log([now.density / (np.array(then.share) * now.scale + now.leakage) for _, now, then in known])
     rise = np.minimum(_alone(absolute), _alone(relative))
     limit = np.log(PAIR_RISE if len(known) > 1 else ALONE_RISE)
-    rms, findings = channel_rms(window), []
+    rms = channel_rms(window)
     for row, (reading, now, _) in enumerate(known):
         risen = rise[row] > limit
         if not np.any(risen):
             continue
-        pair, own = reading.pair, bands[reading.pair]
-        guilty = _guilty(own, reading, risen)
+        pair, own = reading.pair, reading.bands
+        guilty = _guilty(reading, risen)
         width_hz = (window.frequencies_hz[-1] - window.frequencies_hz[0]) / own.w.size
         excess = 2 * width_hz * now.density * -np.expm1(-rise[row]) * (rise[row] > np.log(_COUNTS))
         # rms of the noise if all of it came from the first sensor, in the first sensor's quantity
@@ -137,13 +119,16 @@ def _of_pairs(
             text += "; which of the two it is cannot be told"
         z = float(rise[row].max()) / float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
         value = sizes[column] / float(rms[column])
-        findings.append(SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z))
-    return findings
+        yield SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z)
 
 
-def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
+def _guilty(reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
     """Column of the noisy one of two sensors, from powers that the other places do not explain; None if unclear."""
-    spectra = matched(bands, reading)[risen]
+    bands, h = reading.bands, reading.transfer
+    spectra = bands.spectra.copy()
+    spectra[:, 0] *= h[:, None]  # corrected to the gain, polarity and delay of the second
+    spectra[:, :, 0] *= h.conj()[:, None]
+    spectra = spectra[risen]
     power, n = np.maximum(np.einsum("bii->bi", spectra).real, np.finfo(float).tiny), spectra.shape[1]
     own = spectra[:, :2, :2]
     if n > 2:
@@ -173,11 +158,8 @@ def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
     >>> is_hum(100.1, 138.2, 0.5), is_hum(100.1, 2 * np.pi * 25.0, 0.5), is_hum(88.2, 138.2, 0.5)
     (True, False, False)
     """
-    for mains_hz in _MAINS_HZ:
-        harmonic = round(line_hz / mains_hz)
-        if harmonic and abs(line_hz - harmonic * mains_hz) <= harmonic * _MAINS_OFF_HZ + resolution_hz / 2:
-            break
-    else:
+    near = ((round(line_hz / mains_hz), mains_hz) for mains_hz in MAINS_HZ)
+    if not any(n and abs(line_hz - n * mains_hz) <= n * _MAINS_OFF_HZ + resolution_hz / 2 for n, mains_hz in near):
         return False
     shaft_hz = abs(speed_rad_s) / (2 * np.pi)
     if not np.isfinite(shaft_hz) or shaft_hz == 0:
@@ -185,21 +167,19 @@ def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
     return abs(line_hz - round(line_hz / shaft_hz) * shaft_hz) > resolution_hz
 
 
-def _of_single(
-    window: WindowStatistics, noises: Sequence[ChannelNoise], naming: Naming, reference: SensorReference
-) -> list[SensorFault]:
+def _of_single(window: WindowStatistics, naming: Naming, reference: SensorReference) -> Iterator[SensorFault]:
     known = []
-    for now in noises:
+    for now in channel_noise(window):
         channel = reference.channel(window.states[now.column])
         healthy = None if channel is None else channel.noise
         if healthy is not None and len(healthy.density) == now.density.size:
             known.append((now, healthy))
     if not known:
-        return []
+        return
     absolute = np.array([floor(np.log(now.density)) - floor(np.log(then.density)) for now, then in known])
     relative = np.array([floor(np.log(now.share)) - floor(np.log(then.share)) for now, then in known])
     rise, alone = np.minimum(absolute, relative), np.minimum(_alone(absolute), _alone(relative))
-    rms, findings = channel_rms(window), []
+    rms = channel_rms(window)
     band_hz = float(window.frequencies_hz[-1] - window.frequencies_hz[0])
     for row, (now, then) in enumerate(known):
         state, own = window.states[now.column], float(rms[now.column])
@@ -213,7 +193,7 @@ def _of_single(
                 f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
-            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=now.line_rms / own))
+            yield SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=now.line_rms / own)
         elif risen and now.flat > FLOOR_FLAT and size > LEAST_FLOOR * own:
             factor = float(np.exp(rise[row] / 2))
             text = (
@@ -222,5 +202,4 @@ def _of_single(
                 "cable, earthing or amplifier"
             )
             z = float(rise[row]) / _FLOOR_SCATTER
-            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=size / own, z=z))
-    return findings
+            yield SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=size / own, z=z)

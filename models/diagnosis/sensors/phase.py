@@ -134,13 +134,6 @@ def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> 
     return np.asarray(2 * step_hz * (bins - beside).sum(axis=0)), np.asarray(beside)
 
 
-def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
-    """Index of the bin of a speed, or None if it is not well inside the band."""
-    f = window.frequencies_hz
-    at = round((abs(speed_rad_s) / (2 * np.pi) - f[0]) / (f[1] - f[0]))
-    return at if 2 * _LINE_BINS < at < f.size - 2 * _LINE_BINS else None
-
-
 def _line_at_other_speed(
     window: WindowStatistics, columns: Sequence[int], name: str, reference: SensorReference | None
 ) -> SensorFault | None:
@@ -317,13 +310,15 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
         if np.abs(np.diff(speeds)).sum() < _ERRATIC * np.ptp(speeds):
             return None
         edges = [_WILD_SPEEDS[0] * speeds.min(), _WILD_SPEEDS[1] * speeds.max()]
-    first, last = (_bin(window, edge) for edge in edges)
+    f = window.frequencies_hz
+    first, last = (round((abs(edge) / (2 * np.pi) - f[0]) / (f[1] - f[0])) for edge in edges)
+    inside = first > 2 * _LINE_BINS and last < f.size - 2 * _LINE_BINS
     own = vectors[:, list(columns)]
     out = (np.abs(own if window.removed_by_hop else own.mean(axis=0, keepdims=True)) ** 2).mean(axis=0) / 2
     kept = window.phase_kept
-    if first is None or last is None or kept is None or not np.all(out > 0):
+    if not inside or kept is None or not np.all(out > 0):
         return None
-    step_hz, hop_s = window.frequencies_hz[1] - window.frequencies_hz[0], window.duration_s / len(own)
+    step_hz, hop_s = f[1] - f[0], window.duration_s / len(own)
     # Jitter of more than half a radian miscounts turns at random: the line is then only near the speeds of the hops.
     power = np.einsum("fii->fi", window.spectrum[first : last + 1]).real[:, list(columns)]
     # A resonance also stands out of the spectrum, but its noise does not keep its phase.

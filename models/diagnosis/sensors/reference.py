@@ -6,14 +6,14 @@ The motion shows the machine's resonances, the noise is the floor below them. A 
 hum (`noise.is_hum`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
+from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair, same
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.motion import motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
@@ -34,8 +34,8 @@ class Naming:
     A state that none of the machine's channels measures is called by its own name, with values in SI units.
     """
 
-    def __init__(self, channels: Iterable[Channel] = ()) -> None:
-        self._channels: Mapping[str, Channel] = {state_name(channel): channel for channel in channels}
+    def __init__(self, channels: Iterable[Channel]) -> None:
+        self._channels = {state_name(channel): channel for channel in channels}
 
     def name(self, state: str) -> str:
         """Name of the channel."""
@@ -68,26 +68,6 @@ _SMOOTHED = 3
 
 
 @dataclass(frozen=True, slots=True)
-class PairNoise:
-    """Noise of two sensors of one motion, in bands."""
-
-    density: FloatArray  # (n_bands,), power of their difference in the second's quantity, two-sided, SI²/Hz
-    leakage: FloatArray  # (n_bands,), the part of it that two perfect sensors would show in segments of this length
-    # (n_bands,): power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI²
-    scale: FloatArray
-
-    @property
-    def noise(self) -> FloatArray:
-        """Power of the difference without the leakage."""
-        return np.maximum(self.density - self.leakage, _LEAST_NOISE_PART * self.density)
-
-    @property
-    def share(self) -> FloatArray:
-        """`noise` over `scale`, 1/Hz."""
-        return self.noise / self.scale
-
-
-@dataclass(frozen=True, slots=True)
 class ChannelNoise:
     """Power of one channel that the others do not explain."""
 
@@ -106,46 +86,35 @@ def channel_rms(window: WindowStatistics) -> FloatArray:
     return np.asarray(np.sqrt((rms**2).mean(axis=0)), dtype=np.float64)
 
 
-def single(states: tuple[str, ...]) -> list[int]:
-    """Columns of motions that only one sensor measures."""
-    paired = {column for pair in motion_pairs(states) for column in (pair.first, pair.second)}
-    return [column for column in range(len(states)) if column not in paired]
+class PairNoise:
+    """Noise of two sensors of one motion, in bands."""
+
+    def __init__(self, window: WindowStatistics, reading: PairReading) -> None:
+        bands, h, pair, rms = reading.bands, reading.transfer, reading.pair, channel_rms(window)
+        z, v, cross = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real, bands.spectra[:, 1, 0]
+        power = np.abs(h) ** 2 * z + v
+        # (n_bands,): power of their difference in the second's quantity, two-sided, SI²/Hz
+        self.density: FloatArray = np.maximum(power - 2 * (cross * h.conj()).real, 1e-12 * power)
+        # (n_bands,): power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI²
+        self.scale: FloatArray = rms[pair.second] ** 2 + bands.w ** (2 * pair.order) * rms[pair.first] ** 2
+        # The part of the density that two perfect sensors would show: v = jωx holds for the motion, not for its
+        # windowed segments, F{w dx/dt} = jω F{w x} - F{x dw/dt}. With a Hann window of length T the last term has
+        # 1 / 3 (2π / ωT)² of the power.
+        step_rad_s = 2 * np.pi * (window.frequencies_hz[1] - window.frequencies_hz[0])
+        self.leakage: FloatArray = _LEAKAGE * v * (pair.order * step_rad_s / bands.w) ** 2 / 3
+        self.noise = np.maximum(self.density - self.leakage, _LEAST_NOISE_PART * self.density)
 
 
-def matched(bands: Banded, reading: PairReading) -> ComplexArray:
-    """Banded spectra with the first sensor corrected to the gain, polarity and delay of the second."""
-    h = reading.transfer(bands.w)
-    spectra = bands.spectra.copy()
-    spectra[:, 0] *= h[:, None]
-    spectra[:, :, 0] *= h.conj()[:, None]
-    return spectra
-
-
-def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) -> PairNoise:
-    """Power of the difference of two sensors of one motion."""
-    h = reading.transfer(bands.w)
-    z, v, cross = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real, bands.spectra[:, 1, 0]
-    power = np.abs(h) ** 2 * z + v
-    density = np.maximum(power - 2 * (cross * h.conj()).real, 1e-12 * power)
-    rms, pair = channel_rms(window), reading.pair
-    scale = rms[pair.second] ** 2 + bands.w ** (2 * pair.order) * rms[pair.first] ** 2
-    # v = jωx holds for the motion, not for its windowed segments: F{w dx/dt} = jω F{w x} - F{x dw/dt}. With a Hann
-    # window of length T the last term has 1 / 3 (2π / ωT)² of the power.
-    step_rad_s = 2 * np.pi * (window.frequencies_hz[1] - window.frequencies_hz[0])
-    leakage = _LEAKAGE * v * (pair.order * step_rad_s / bands.w) ** 2 / 3
-    return PairNoise(np.asarray(density, dtype=np.float64), np.asarray(leakage, dtype=np.float64), scale)
-
-
-def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[ChannelNoise]:
-    """Power of the given columns that the other channels do not explain; empty if there are too few data."""
+def channel_noise(window: WindowStatistics) -> list[ChannelNoise]:
+    """Power of channels without a second sensor that the others do not explain; empty if there are too few data."""
     rms = channel_rms(window)
+    paired = {column for pair in motion_pairs(window.states) for column in (pair.first, pair.second)}
+    columns = [column for column in range(len(window.states)) if column not in paired]
     n_bins, n = window.frequencies_hz.size, len(window.states)
     if not columns or n < 2 or window.n_segments < 2 * n or not np.all(rms > 0):
         return []
-    edges = pair_bands(n_bins)
-    counts = np.diff(np.append(edges, n_bins))
-    spectra = np.add.reduceat(window.spectrum, edges) / counts[:, None, None]
-    left = _conditional(np.asarray(spectra, dtype=np.complex128))
+    counts = np.diff(np.append(pair_bands(n_bins), n_bins))
+    left = _conditional(window.banded_spectrum / counts[:, None, None])
     if left.shape[0] < _SMOOTHED:
         return []
     flat = (np.log(left) < floor(np.log(left)) + np.log(_FLAT)).mean(axis=0)
@@ -280,6 +249,12 @@ class SensorReference(BaseModel, extra="forbid", frozen=True, strict=True, allow
         return next((pair for pair in self.pairs if (pair.first, pair.second) == (first, second)), None)
 
 
+PERFECT = PairReference(
+    first="", second="", log_gain=0, log_gain_spread=0, polarity=1, delay_s=0, delay_spread_s=0, shared=1, same=1
+)
+"""What is expected of two sensors without a reference."""
+
+
 def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReference:
     """Learn the sensors' reference from healthy windows that do not overlap.
 
@@ -292,14 +267,9 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         raise EstimationError("no healthy window to learn the sensors from")
     windows = [window.as_mounted for window in windows]
     states = windows[0].states
-    for window in windows:
-        if window.states != states:
-            raise EstimationError(
-                f"healthy windows hold different channels: {', '.join(states)} and {', '.join(window.states)}"
-            )
     pairs = []
     for pair in motion_pairs(states):
-        bands = [banded(window, pair) for window in windows]
+        bands = [Banded(window, pair) for window in windows]
         readings = [read_pair(window, pair, own) for window, own in zip(windows, bands, strict=True)]
         there = [reading for reading in readings if reading is not None]
         if len(there) < len(readings):
@@ -308,10 +278,12 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         if any(one.lead_rad_s for one in there):
             again = [read_pair(window, pair, own, lead_rad_s) for window, own in zip(windows, bands, strict=True)]
             there = [one for one in again if one is not None]
-        noises = [pair_noise(window, own, one) for window, own, one in zip(windows, bands, there, strict=True)]
-        pairs.append(_pair(states, there, min(same(own) for own in bands), _noise(noises)))
-    alone = [channel_noise(window, single(states)) for window in windows]
-    noise = {each[0].column: _noise(each) for each in zip(*alone, strict=False)}
+        noises = [PairNoise(window, one) for window, one in zip(windows, there, strict=True)]
+        pairs.append(_pair(there, _noise([(one.noise, one.noise / one.scale) for one in noises])))
+    noise = {
+        each[0].column: _noise([(one.density, one.share) for one in each], max(one.line_rms for one in each))
+        for each in zip(*map(channel_noise, windows), strict=False)
+    }
     speeds = np.concatenate([window.hop_speed_rad_s for window in windows])
     return SensorReference(
         n_windows=len(windows),
@@ -322,20 +294,15 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
     )
 
 
-def _noise(noises: Sequence[PairNoise | ChannelNoise]) -> NoiseReference | None:
-    """Mean of the windows' noise."""
-    density = np.mean([one.noise if isinstance(one, PairNoise) else one.density for one in noises], axis=0)
-    share = np.mean([one.share for one in noises], axis=0)
+def _noise(noises: Sequence[tuple[FloatArray, FloatArray]], line_rms: float = 0.0) -> NoiseReference | None:
+    """Mean of the windows' noise densities and of their shares."""
+    density, share = (np.mean(each, axis=0) for each in zip(*noises, strict=True))
     if not (np.all(density > 0) and np.all(share > 0) and np.all(np.isfinite(share))):
         return None
-    return NoiseReference(
-        density=tuple(density.tolist()),
-        share=tuple(share.tolist()),
-        line_rms=max(one.line_rms if isinstance(one, ChannelNoise) else 0.0 for one in noises),
-    )
+    return NoiseReference(density=tuple(density.tolist()), share=tuple(share.tolist()), line_rms=line_rms)
 
 
-def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseReference | None = None) -> ChannelReference:
+def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseReference | None) -> ChannelReference:
     means = np.concatenate([window.hop_waveform.mean[:, column] for window in windows])
     squares = np.concatenate([window.hop_waveform.rms[:, column] ** 2 for window in windows])
     rotation = rotation_spread = None
@@ -356,16 +323,13 @@ def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseRefer
     )
 
 
-def _pair(
-    states: tuple[str, ...], readings: list[PairReading], least_same: float, noise: NoiseReference | None
-) -> PairReference:
+def _pair(readings: list[PairReading], noise: NoiseReference | None) -> PairReference:
     """Mean of the windows' readings; the spread combines their scatter beyond their own errors and the mean's error."""
     figures = [(one.log_gain, one.log_gain_error, one.delay_s, one.delay_error_s) for one in readings]
     gains, gain_errors, delays, delay_errors = np.array(figures).T.copy()
-    pair = readings[0].pair
     return PairReference(
-        first=states[pair.first],
-        second=states[pair.second],
+        first=readings[0].first,
+        second=readings[0].second,
         log_gain=float(gains.mean()),
         log_gain_spread=_spread(gains, gain_errors),
         polarity=1 if sum(reading.polarity for reading in readings) >= 0 else -1,
@@ -373,13 +337,12 @@ def _pair(
         delay_spread_s=_spread(delays, delay_errors),
         lead_rad_s=readings[0].lead_rad_s,
         shared=min(reading.shared for reading in readings),
-        same=least_same,
+        same=min(same(reading.bands) for reading in readings),
         noise=noise,
     )
 
 
 def _spread(values: FloatArray, errors: FloatArray) -> float:
-    own = float(np.mean(errors**2))
-    n = len(values)
+    own, n = float(np.mean(errors**2)), len(values)
     scatter = float(values.var(ddof=1)) if n > 1 else own
     return float(np.sqrt(max(scatter - own, 0.0) + max(scatter, own) / n))

@@ -14,12 +14,9 @@ from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.measures import STANDS_RAD_S
 from models.levels.reference import QUIET
-from models.signals.block import FloatArray
 
-_SLOW = 0.5
-"""Part of the window's highest speed from which on a hop counts as running, however quiet it is."""
-_STEADY = 0.15
-"""Largest relative range of speed in a window that is taken as steady running: it excludes slowing down."""
+_SLOW = 0.5  # part of the window's highest speed from which on a hop counts as running, however quiet it is
+_STEADY = 0.15  # largest relative range of speed in a window of steady running, not of slowing down
 
 
 def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
@@ -56,7 +53,10 @@ class Standstill:
             if speeds.max() - speeds.min() <= _STEADY * speeds.mean():
                 self._running = np.median(hops.rms, axis=0)
             return ""
-        running = self._running_rms(window)
+        running = self._running if self._running.size else np.full(len(window.sensors), np.nan)
+        if self._reference is not None and self._reference.speed_rad_s is not None:
+            known = [self._reference.channel(state) for state in window.sensors]
+            running = np.array([own if one is None else one.rms for own, one in zip(running, known, strict=True)])
         vibrations = [column for column, state in enumerate(window.sensors) if state != "theta"]
         compared = [column for column in vibrations if running[column] > 0]
         if not compared:
@@ -75,24 +75,10 @@ class Standstill:
             "parameters are not judged, and channels are not compared"
         )
 
-    def _running_rms(self, window: WindowStatistics) -> FloatArray:
-        """Rms of the running machine by column; NaN where it is not known."""
-        running = self._running if self._running.size else np.full(len(window.sensors), np.nan)
-        if self._reference is None or self._reference.speed_rad_s is None:
-            return running
-        known = [self._reference.channel(state) for state in window.sensors]
-        return np.array([own if one is None else one.rms for own, one in zip(running, known, strict=True)])
-
     def checkpoint(self) -> dict[str, np.ndarray]:
         """The complete state as named arrays."""
         return {"running": self._running}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Restore the state that `checkpoint` returned.
-
-        Raises
-        ------
-        CheckpointError
-            If the array is missing, or has another type or shape.
-        """
+        """Restore the state that `checkpoint` returned."""
         self._running = checked(arrays, "running", np.float64, (None,))

@@ -7,7 +7,6 @@ time would restore mostly noise below the band, and make a window depend on the 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +17,14 @@ from models.signals.sensor import Sensor
 _ComplexArray = npt.NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True)
 class Equaliser:
     """Responses of a machine's sensors, one column each."""
 
-    # (n,): corner and order of the high-pass, 0 Hz where there is none; delay behind the times of the samples.
-    corner_hz: FloatArray
-    order: npt.NDArray[np.intp]
-    delay_s: FloatArray
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        # (n,): corner and order of the high-pass, 0 Hz where there is none; delay behind the times of the samples.
+        self._corner_hz = np.array([one.high_pass_hz or 0.0 for one in sensors])
+        self._order = np.array([one.high_pass_order or 1 for one in sensors], dtype=np.intp)
+        self._delay_s = np.array([(one.delay_us or 0.0) * 1e-6 for one in sensors])
 
     def response(self, frequency_hz: FloatArray) -> _ComplexArray:
         """Complex gain of each sensor, shape (..., n); 1 where the frequency is unknown (nan).
@@ -33,9 +32,9 @@ class Equaliser:
         Frequencies, shape (...), are negative for a shaft angle that decreases.
         """
         f = frequency_hz[..., np.newaxis]
-        below = self.corner_hz / (1j * np.where(f == 0, np.nan, f))
-        damped = np.where(self.order == 2, 1 + math.sqrt(2) * below + below**2, 1 + below)
-        return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self.delay_s) / damped, nan=1.0), dtype=np.complex128)
+        below = self._corner_hz / (1j * np.where(f == 0, np.nan, f))
+        damped = np.where(self._order == 2, 1 + math.sqrt(2) * below + below**2, 1 + below)
+        return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self._delay_s) / damped, nan=1.0), dtype=np.complex128)
 
     def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
         """What the sensors' responses remove from the correlations, shape (n_hops, n_lags, n, n).
@@ -57,8 +56,4 @@ def equaliser_of(sensors: Sequence[Sensor]) -> Equaliser | None:
     """Equaliser of sensors, one per column; None if the file states no high-pass and no delay."""
     if all(one.high_pass_hz is None and one.delay_us is None for one in sensors):
         return None
-    return Equaliser(
-        np.array([one.high_pass_hz or 0.0 for one in sensors]),
-        np.array([one.high_pass_order or 1 for one in sensors], dtype=np.intp),
-        np.array([(one.delay_us or 0.0) * 1e-6 for one in sensors]),
-    )
+    return Equaliser(sensors)

@@ -1,8 +1,14 @@
-"""Lines that say nothing about the machine and that theory leaves out: mains hum, and lines of the healthy machine.
+"""What in a window's segments is not of the machine: lines that theory leaves out, and changes of the forces' level.
 
-A line of a hundredth of a channel's rms matters where one force moves all channels, as channels then differ by sensor
-noise alone. So all channels are looked at together, relative to the bins around. The phase of a steady line advances
-evenly from segment to segment, and that of a multiple of the speed follows the shaft; that of noise does neither.
+The lines are mains hum and those of the healthy machine. A line of a hundredth of a channel's rms matters where one
+force moves all channels, as channels then differ by sensor noise alone. So all channels are looked at together,
+relative to the bins around. The phase of a steady line advances evenly from segment to segment, and that of a multiple
+of the speed follows the shaft; that of noise does neither.
+
+The level of the random forces may change within a window, too. The cross-spectra are treated as a mean over segments of
+equal level. If the level steps or drifts, few segments dominate that mean; it scatters like a mean over fewer segments,
+which looks like a misfit. Scaled to one level, segments of one rotor are alike; those with another rotor, a rub or a
+line are not, and remain a misfit.
 """
 
 from collections.abc import Sequence
@@ -14,16 +20,16 @@ import numpy.typing as npt
 from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 
-_LOBE = 2  # a Hann window spreads a line over two bins on either side
-_BESIDE = range(_LOBE + 1, _LOBE + 4)  # bins away, that are the surroundings
+LOBE = 2  # a Hann window spreads a line over two bins on either side
+_BESIDE = range(LOBE + 1, LOBE + 4)  # bins away, that are the surroundings
 _STANDS_OUT = 4.0  # power of the motion that stands out most, over that of its surroundings; up to 2.5 for noise
 _SMOOTH = 3  # segments to either side over which the phase of a removed line is averaged
 _HANN_POWER, _AT_ONE = 0.375, 1e-6  # power of a lobe over the square of the sum of its amplitudes
 _CHANCE = 1e-4  # for one bin that stands out
-_FEWEST_SEGMENTS = 6
+FEWEST_SEGMENTS = 6
 _ORDERS = range(2, 13)
-_MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # mains frequencies, and their relative tolerance
-_LINE_TOLERANCE = 0.02  # relative tolerance for the same line
+MAINS_HZ, _MAINS_VARY = (50.0, 60.0), 0.004  # mains frequencies, and their relative tolerance
+LINE_TOLERANCE = 0.02  # relative tolerance for the same line
 _HUM = 0.05  # part of the random power up to which a line counts as hum; above, it is reported like any other
 _HALVES = (0.5, 1.5, 2.5)  # multiples of the speed that a rub or looseness causes
 
@@ -62,38 +68,33 @@ def excluded_lines(
 ) -> tuple[ExcludedLine, ...]:
     """Lines that say nothing about the machine, in Fourier coefficients without mean and rotation.
 
-    Parameters
-    ----------
-    segments : ndarray, shape (n_bins, n_segments, n)
-    spectrum : ndarray, shape (n_bins, n, n)
-        Their cross-spectra, in any unit.
-    speeds_rad_s : tuple of float
-        Slowest and fastest hop. Where they are nan, or the shaft stands, no line can be told from the rotation.
-    known : sequence of KnownLine, optional
-        Those of the healthy machine. If None, all lines count as such, multiples of the speed too.
-    turning : ndarray, shape (n_segments, n_bins), optional
-        Fourier coefficients of the cosine of the shaft angle.
-    alive : ndarray, shape (n,), optional
-        Channels that have a signal: the rounding errors of a dead one look like lines anywhere.
+    `segments` has shape (n_bins, n_segments, n), and `spectrum`, (n_bins, n, n), are their cross-spectra in any unit.
+    The speeds are those of the slowest and the fastest hop; where they are nan, or the shaft stands, no line can be
+    told from the rotation. Without `known`, the lines of the healthy machine, all lines count as such, multiples of the
+    speed too. `turning`, (n_segments, n_bins), is the cosine of the shaft angle, and `alive`, (n,), says which channels
+    have a signal: the rounding errors of a dead one look like lines anywhere.
     """
     if alive is not None and not alive.all():
         place = np.eye(alive.size)[:, alive]
         own = segments[:, :, alive], spectrum[:, alive][:, :, alive]
         return tuple(one.turned(place) for one in excluded_lines(*own, frequencies_hz, speeds_rad_s, known, turning))
     slowest_hz, fastest_hz = sorted(abs(speed) / (2 * np.pi) for speed in speeds_rad_s)
-    enough = segments.shape[1] >= _FEWEST_SEGMENTS and segments.shape[2] and frequencies_hz.size > 2 * _BESIDE.stop
+    enough = segments.shape[1] >= FEWEST_SEGMENTS and segments.shape[2] and frequencies_hz.size > 2 * _BESIDE.stop
     if not (slowest_hz > 0 and enough):
         return ()
     step_hz, speed_hz = frequencies_hz[1] - frequencies_hz[0], (slowest_hz + fastest_hz) / 2
+    away = np.abs(frequencies_hz - np.clip(frequencies_hz, slowest_hz, fastest_hz)) > LOBE * step_hz
+    mains = np.array(MAINS_HZ)[:, np.newaxis]
+    off_hz = np.abs(frequencies_hz - mains * np.maximum(np.round(frequencies_hz / mains), 1.0)).min(axis=0)
+    hum = (off_hz <= _MAINS_VARY * frequencies_hz + step_hz / 2) & away
+    healthy = _near_known(frequencies_hz, speed_hz, known)
     found = []
     try:
-        at = np.flatnonzero(_bins_to_search(frequencies_hz, slowest_hz, fastest_hz, known))
+        at = np.flatnonzero(hum | (healthy & away))
         strength, motions = _outstanding(spectrum, at, (at, at))
-        peaks = np.zeros(frequencies_hz.size + 2 * _LOBE)
-        peaks[at + _LOBE] = strength
-        highest = peaks[at + np.arange(2 * _LOBE + 1)[:, np.newaxis]].max(axis=0)
-        healthy = _near_known(frequencies_hz, speed_hz, known)
-        hum = _bins_to_search(frequencies_hz, slowest_hz, fastest_hz, ())
+        peaks = np.zeros(frequencies_hz.size + 2 * LOBE)
+        peaks[at + LOBE] = strength
+        highest = peaks[at + np.arange(2 * LOBE + 1)[:, np.newaxis]].max(axis=0)
         for n in np.flatnonzero((strength > _STANDS_OUT) & (strength == highest)):
             own = segments[at[n]] @ motions[n]
             if not _phase_is_steady(own):
@@ -106,11 +107,11 @@ def excluded_lines(
                 found.append(_with_power(line, segments, frequencies_hz, phases, centre_hz) if is_hum else line)
         if turning is None:
             return tuple(found)
-        rotation = _unit(turning[:, np.abs(frequencies_hz - speed_hz).argmin()])
+        rotation = phases_of(turning[:, np.abs(frequencies_hz - speed_hz).argmin()])
         for order in _ORDERS:
             half_hz = order * (fastest_hz - slowest_hz) / 2
             at = np.flatnonzero(np.abs(frequencies_hz - order * speed_hz) <= half_hz + step_hz)
-            had = known is not None and any(abs(one / order - 1) <= _LINE_TOLERANCE for _, one in known)
+            had = known is not None and any(abs(one / order - 1) <= LINE_TOLERANCE for _, one in known)
             if at.size and (had or known is None):
                 strength, motions = _outstanding(spectrum, at, (at[:1], at[-1:]))
                 # All bins of a lobe have the phase in the middle of the segment, with a sign that alternates.
@@ -123,22 +124,6 @@ def excluded_lines(
     except np.linalg.LinAlgError:  # a dead channel, or one that is there twice
         return ()
     return tuple(found)
-
-
-def _bins_to_search(
-    frequencies_hz: FloatArray, slowest_hz: float, fastest_hz: float, known: Sequence[KnownLine] | None
-) -> npt.NDArray[np.bool_]:
-    """Bins to search: where a known line or hum may be, without the rotation."""
-    step_hz = frequencies_hz[1] - frequencies_hz[0]
-    if known is None:
-        wanted = np.ones(frequencies_hz.size, dtype=np.bool_)
-    else:
-        mains = np.array(_MAINS_HZ)[:, np.newaxis]
-        off = np.abs(frequencies_hz - mains * np.maximum(np.round(frequencies_hz / mains), 1.0)).min(axis=0)
-        wanted = off <= _MAINS_VARY * frequencies_hz + step_hz / 2
-        wanted |= _near_known(frequencies_hz, (slowest_hz + fastest_hz) / 2, known)
-    away_hz = np.abs(frequencies_hz - np.clip(frequencies_hz, slowest_hz, fastest_hz))
-    return np.asarray(wanted & (away_hz > _LOBE * step_hz))
 
 
 def _beside_multiples(line_hz: float, slowest_hz: float, fastest_hz: float, by_hz: float) -> bool:
@@ -154,7 +139,7 @@ def _near_known(
     near = np.full(frequencies_hz.size, known is None)
     for line_hz, order in known or ():
         for then in (line_hz, order * speed_hz):
-            near |= np.abs(frequencies_hz - then) <= _LINE_TOLERANCE * then
+            near |= np.abs(frequencies_hz - then) <= LINE_TOLERANCE * then
     return near
 
 
@@ -163,8 +148,8 @@ def _share(segments: ComplexArray, at: int, own: ComplexArray) -> float:
 
     In a single channel it says little: where hardly anything but the rotation moves one, faint hum is most of the rest.
     """
-    lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
-    line = np.abs(_unit(own).conj() @ segments[lobe] / own.size) ** 2
+    lobe = slice(max(0, at - LOBE), at + LOBE + 1)
+    line = np.abs(phases_of(own).conj() @ segments[lobe] / own.size) ** 2
     noise = (np.abs(segments[lobe]) ** 2).mean(axis=1) / own.size
     return float((line - noise).sum() / (np.abs(segments) ** 2).mean(axis=1).sum())
 
@@ -174,14 +159,14 @@ def _line_phases(own: ComplexArray, line: ExcludedLine, step_hz: float) -> tuple
 
     The phases may drift, but over more than a few segments: following every segment would follow a resonance as well.
     """
-    unit = _unit(own)
+    unit = phases_of(own)
     advance = np.angle(np.mean(unit[1:] * unit[:-1].conj()))
     steady = np.exp(1j * advance * np.arange(own.size))
     wandering = np.convolve(np.pad(unit * steady.conj(), _SMOOTH, mode="edge"), np.ones(2 * _SMOOTH + 1), mode="valid")
     # Segments are half a segment apart: in that time a line between the bins turns by up to half a turn more or less.
     every_s = 1 / (2 * step_hz)
     off = np.angle(np.exp(1j * (advance - 2 * np.pi * line.frequency_hz * every_s))) / (2 * np.pi * every_s)
-    return _unit(steady * wandering), float(line.frequency_hz + off)
+    return phases_of(steady * wandering), float(line.frequency_hz + off)
 
 
 def _with_power(
@@ -194,7 +179,7 @@ def _with_power(
 ) -> ExcludedLine:
     """The line with the power coherent with its phases in all channels; it wanders by `half_hz` to either side."""
     step_hz = frequencies_hz[1] - frequencies_hz[0]
-    lobe = np.flatnonzero(np.abs(frequencies_hz - centre_hz) <= half_hz + (_LOBE + 0.5) * step_hz)
+    lobe = np.flatnonzero(np.abs(frequencies_hz - centre_hz) <= half_hz + (LOBE + 0.5) * step_hz)
     if not lobe.size:
         return line
     off = np.abs(frequencies_hz[lobe] - centre_hz) / step_hz
@@ -228,7 +213,7 @@ def _outstanding(
 
 def _skirt(strength: float) -> float:
     """Number of bins from a line at which its skirts are still seen: a Hann window's fall with the sixth power."""
-    return float(max(_LOBE + 1, 2 * strength ** (1 / 6)))
+    return float(max(LOBE + 1, 2 * strength ** (1 / 6)))
 
 
 def _phase_is_steady(own: ComplexArray) -> bool:
@@ -237,7 +222,7 @@ def _phase_is_steady(own: ComplexArray) -> bool:
     The frequency may be off the bin and drift slowly. For n segments of noise that overlap by half, the mean of unit
     vectors at the change of that angle has length u or more with about the probability (1 - u²)ⁿ⁻⁴.
     """
-    unit = _unit(own)
+    unit = phases_of(own)
     return bool((1 - _mean_length(unit[:-2] * unit[1:-1].conj() ** 2 * unit[2:]) ** 2) ** (own.size - 4) < _CHANCE)
 
 
@@ -247,12 +232,51 @@ def _phase_follows_rotation(own: ComplexArray, rotation: ComplexArray, order: in
     The mean of n unit vectors has length u or more with the probability (1 - u²)ⁿ⁻¹; the segments overlap, so every
     second one is evidence.
     """
-    return bool((1 - _mean_length(_unit(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
+    return bool((1 - _mean_length(phases_of(own) * rotation.conj() ** order) ** 2) ** (own.size / 2) < _CHANCE)
 
 
-def _unit(coefficients: ComplexArray) -> ComplexArray:
+def phases_of(coefficients: ComplexArray) -> ComplexArray:
+    """Numbers of length one with the same phases."""
     return np.asarray(coefficients / np.maximum(np.abs(coefficients), np.finfo(float).tiny), dtype=np.complex128)
 
 
 def _mean_length(unit: ComplexArray) -> float:
     return min(1.0, float(abs(unit.mean())))
+
+
+_BLOCK = 16  # bins that are compared at once: many more than channels, and few enough to share one colour
+_STEADY = 30.0  # variance of the levels, times the coefficients in each, below which a window is stationary; 3 is usual
+_ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all segments are compared with
+
+
+def summed(segments: ComplexArray) -> ComplexArray:
+    """Cross-products of Fourier coefficients, shape (..., n_segments, n), summed over segments: shape (..., n, n)."""
+    return np.asarray(segments.swapaxes(-1, -2) @ segments.conj(), dtype=np.complex128)
+
+
+def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequence[int]) -> FloatArray | None:
+    """Powers of the segments of a window relative to their mean, shape (n_segments,); None if it is stationary.
+
+    They are medians over the band and over uncorrelated motions, so a line that appears, or a force on a part of the
+    band or of the motions, does not change them. `segments` are Fourier coefficients, shape (n_bins, n_segments, n),
+    without mean and rotation, and `spectrum` is `summed` of them; `columns` are one channel of each motion.
+    """
+    n, count = len(columns), segments.shape[1]
+    blocks = segments.shape[0] // _BLOCK
+    if not n or not blocks:
+        return None
+    own = np.take(segments[: blocks * _BLOCK], columns, axis=2).reshape(blocks, _BLOCK, count, n)
+    mean = spectrum[: blocks * _BLOCK, columns][:, :, columns].reshape(blocks, _BLOCK, n, n).sum(axis=1)
+    if not np.all(np.isfinite(mean)):
+        return None
+    levels = np.ones(count)
+    for _ in range(_ROUNDS):
+        motions = own.reshape(blocks, -1, n) @ np.linalg.eigh(mean)[1].conj()
+        powers = (motions.real**2 + motions.imag**2).reshape(own.shape).sum(axis=1)  # (blocks, n_segments, n)
+        usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+        levels = np.median(powers / usual, axis=(0, 2))
+        levels /= max(float(levels.mean()), np.finfo(float).tiny)
+        if np.mean((levels - 1) ** 2) * own[:, :, 0].size < _STEADY or not np.all(levels > 0):
+            return None
+        mean = summed((own / np.sqrt(levels)[:, np.newaxis]).reshape(blocks, -1, n))
+    return levels

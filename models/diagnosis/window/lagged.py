@@ -8,25 +8,15 @@ from models.signals.block import FloatArray
 
 
 def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> FloatArray:
-    """Sums of lagged products; samples of the history are references only.
+    """Sums ``[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the samples after the history, shape (n_lags, n, n).
+
+    `a` has shape (n, before + n_samples): the first `before` samples, the history, are references only. The lags begin
+    at zero and are at most `before`.
 
     The lags are short and the samples many, so the samples are cut into blocks of twice the longest lag. The blocks'
     cross-spectra (each block's reference reaches back by the longest lag, where its response is zero) are added up
     before one inverse transform. If only every k-th lag is wanted, the cross-spectra are folded first, which shortens
     the transform: for every second lag, the two halves of the spectrum are added.
-
-    Parameters
-    ----------
-    a : ndarray, shape (n, before + n_samples)
-    lags : ndarray of int, shape (n_lags,)
-        From zero on, at most `before`.
-    before : int
-        Samples of history.
-
-    Returns
-    -------
-    ndarray, shape (n_lags, n, n)
-        ``[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the samples after the history.
     """
     longest, n, n_samples = int(lags[-1]), a.shape[0], a.shape[1] - before
     if longest == 0:

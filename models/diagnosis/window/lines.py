@@ -18,11 +18,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.diagnosis.window.excluded import KnownLine
+from models.diagnosis.window.excluded import FEWEST_SEGMENTS, LINE_TOLERANCE, LOBE, KnownLine, phases_of
 from models.diagnosis.window.moments import ComplexArray, HopMoments, Plan
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -32,14 +31,11 @@ _MOST_FAINT_SPREAD = 1.8
 """The same: 1.2 to 1.4 for a faint line, over 2.2 for what rings in a few segments and keeps its phase there."""
 _STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings, for a line seen in one window alone, and in two
 _NEIGHBOURHOOD_HZ = 4.0
-_LOBE = 2  # a Hann window spreads a line over two bins on either side
-_FEWEST_SEGMENTS = 6
 _HARMONICS = 12
 _CHANCE = 1e-9
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
-_LOUD, _LINE_TOLERANCE = 0.02, 0.02
-"""Part of a channel's random power above which a new line is reported, and relative tolerance for the same line."""
+_LOUD = 0.02  # part of a channel's random power above which a new line is reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +68,7 @@ def steady_lines(
         every[:, :, : len(states)] /= plan.equaliser.response(plan.frequencies_hz)
     segments = every[:, :, : len(states)]
     segments[:, :, np.isin(states, list(faulty))] = 0
-    if segments.shape[0] < _FEWEST_SEGMENTS:
+    if segments.shape[0] < FEWEST_SEGMENTS:
         return ()
     power = segments.real**2 + segments.imag**2
     mean = power.mean(axis=0)
@@ -82,10 +78,11 @@ def steady_lines(
     floor = scipy.ndimage.median_filter(mean, size=(size, 1), mode="nearest")
     total = np.maximum(np.diag(window.correlation[0]), np.finfo(float).tiny)
     speed_hz = abs(window.speed_rad_s) / (2 * np.pi)
-    rotation = _near_rotation(frequencies_hz, speed_hz, step_hz)
+    multiples_hz = speed_hz * np.arange(1, _HARMONICS + 1)  # nan, and near none, where the speed is not known
+    rotation = np.asarray((np.abs(frequencies_hz[:, None] - multiples_hz) <= (LOBE + 1) * step_hz).any(axis=1))
     found: dict[int, Line] = {}
     for at, column in np.argwhere((mean > _FAINT * floor) & ~rotation[:, None]):
-        lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
+        lobe = slice(max(0, at - LOBE), at + LOBE + 1)
         if mean[at, column] < mean[lobe, column].max():
             continue
         spread = float((power[:, at, column] ** 2).mean() / mean[at, column] ** 2)
@@ -114,14 +111,13 @@ def _beside_multiples(
         return
     frequencies_hz, states = plan.frequencies_hz, plan.mounted
     step_hz, speed_hz = float(frequencies_hz[1] - frequencies_hz[0]), abs(window.speed_rad_s) / (2 * np.pi)
-    if speed_hz <= (2 * _LOBE + 1) * step_hz:  # a multiple would look like a line beside the next one
+    if speed_hz <= (2 * LOBE + 1) * step_hz:  # a multiple would look like a line beside the next one
         return
-    turning = every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1]
-    turning = turning / np.maximum(np.abs(turning), np.finfo(float).tiny)
+    turning = phases_of(every[:, np.abs(frequencies_hz - speed_hz).argmin(), len(states) + 1])
     for order in range(1, _HARMONICS + 1):
         away_hz = np.abs(frequencies_hz - order * speed_hz)
-        near = away_hz <= (_LOBE + 1) * step_hz
-        around = ~near & (away_hz <= (_LOBE + 1) * step_hz + _NEIGHBOURHOOD_HZ)
+        near = away_hz <= (LOBE + 1) * step_hz
+        around = ~near & (away_hz <= (LOBE + 1) * step_hz + _NEIGHBOURHOOD_HZ)
         if not (near.any() and around.any()):
             continue
         left = every[:, near, : len(states)] * (turning.conj() ** order)[:, None, None]
@@ -175,13 +171,7 @@ class LatestLines:
         return {"lines_end_ns": ends, "lines": np.array([line for _, line in self._seen]).reshape(-1, 2)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Continue where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Continue where `checkpoint` was called."""
         ends = checked(arrays, "lines_end_ns", np.int64, (None,)).tolist()
         lines = checked(arrays, "lines", np.float64, (len(ends), 2)).tolist()
         self._seen = [(end_ns, (hz, order)) for end_ns, (hz, order) in zip(ends, lines, strict=True)]
@@ -190,7 +180,7 @@ class LatestLines:
 def _is_known(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> bool:
     """Whether a line is one of these, at its frequency or order."""
     own = line.known(speed_rad_s)
-    return any(abs(now - then) <= _LINE_TOLERANCE * then for one in known for now, then in zip(own, one, strict=True))
+    return any(abs(now - then) <= LINE_TOLERANCE * then for one in known for now, then in zip(own, one, strict=True))
 
 
 def _chance(own: ComplexArray) -> float:
@@ -217,10 +207,3 @@ def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tup
     one_way &= bool(back < _OTHER_WAY * there) and min(most, size - most) * n_segments >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
     return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _chance(own) < _CHANCE
-
-
-def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:
-    if not np.isfinite(speed_hz):
-        return np.zeros(frequencies_hz.size, dtype=np.bool_)
-    multiples = speed_hz * np.arange(1, _HARMONICS + 1)
-    return np.asarray(np.min(np.abs(frequencies_hz[:, None] - multiples), axis=1) <= (_LOBE + 1) * step_hz)

@@ -153,17 +153,11 @@ def states_of(machine: MachineFile) -> tuple[str, ...]:
 def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False, thorough: bool = True) -> Plan:
     """Derive the plan of a machine.
 
-    Parameters
-    ----------
-    lagged : bool
-        Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
-    levels : bool
-        Whether levels are wanted.
-    thorough : bool
-        Whether with levels `models.levels.contact` and the lines of `models.levels.bands` are wanted too, a fifth of
-        the time that a hop's moments take.
+    With `lagged`, correlations are taken at all lags, as the networks need them, otherwise at lag zero alone; with
+    `levels`, levels are taken, and if `thorough`, `models.levels.contact` and the lines of `models.levels.bands` too, a
+    fifth of the time that a hop's moments take.
     """
-    window, rate_hz = machine.window, machine.rate_hz
+    window, operation, rate_hz = machine.window, machine.operation, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
     states = states_of(machine)
     others = tuple(name for name in order if name not in states and name != "theta")
@@ -172,7 +166,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
     rows = [[parts_seen(one).get(name, 0.0) for name in states] for one in channels[: len(states)]]
     seen = np.array(rows).reshape(len(states), len(states))
     runout = np.array([one.runout for one in channels], dtype=np.complex128)
-    band_hz = machine.levels.band(None if machine.operation is None else machine.operation.speed_rpm)
+    band_hz = machine.levels.band(None if operation is None else operation.speed_rpm)
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
@@ -195,8 +189,8 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False,
         hops=window.hops,
         max_span_ns=round(window.max_span_s * 1e9),
         time_scale=machine.time_scale,
-        speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
-        speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
+        speed_rad_s=None if operation is None else operation.speed_rad_s,
+        speed_tolerance=0.0 if operation is None else operation.speed_tolerance,
         others=others,
         levels=level_plan(channels, rate_hz, band_hz, runout, lines=thorough) if levels else None,
         thorough=thorough,
@@ -245,13 +239,7 @@ class HopMoments:
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopMoments":
-        """Moments from what `checkpoint` gave.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """Moments from what `checkpoint` gave."""
         start_ns, end_ns = checked(arrays, "times_ns", np.int64, (2,)).tolist()
         line = checked(arrays, "line", np.float64, (None,)).tolist()
         turned_rad, jump_rad = checked(arrays, "turned_rad", np.float64, (2,)).tolist()
@@ -270,17 +258,11 @@ class HopMoments:
 
 
 def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: int) -> HopMoments:
-    """Compute the moments of one hop.
+    """Compute the moments of one hop, whose own first sample is from `start_ns`.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (preamble + hop, n_states [+ 1])
-        SI samples as `Plan.to_si` gives them, without a gap; the first `preamble` rows are history.
-    level : ndarray, shape (n_states,)
-        Fixed level subtracted before anything is summed. A proximity probe's gap voltage may be a million times its
-        fluctuation; squared, it would swallow every digit.
-    start_ns : int
-        Time of the first sample of the hop itself.
+    The samples are as `Plan.to_si` gives them, shape (preamble + hop, width), without a gap; the first `preamble` rows
+    are history. `level`, shape (n_states,), is subtracted before anything is summed: a proximity probe's gap voltage
+    may be a million times its fluctuation; squared, it would swallow every digit.
     """
     n_states = len(plan.states)
     rows = np.ascontiguousarray(samples.T)  # each channel's samples contiguous: all that follows runs along them
@@ -383,10 +365,8 @@ def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
         speeds = [hop.turned_rad / hop_s for hop in hops]
         by_hop = max(speeds) - min(speeds) > STEADY * abs(sum(speeds) / len(speeds))
         return Rotation("phase reference", np.array(speeds), by_hop, settled)
-    followed = None
-    if plan.speed_rad_s is not None:
-        lines = tuple(hop.line for hop in hops)
-        followed = followed_speeds(lines, hop_s)
+    lines = tuple(hop.line for hop in hops)
+    followed = None if plan.speed_rad_s is None else followed_speeds(lines, hop_s)
     if followed is None:
         return Rotation("unknown", np.full(len(hops), np.nan), by_hop=False, settled=settled)
     # The line's speed is that in the middle of the hop with its history; the middle of the hop itself is later.

@@ -30,7 +30,7 @@ class MotionPair:
 
 @lru_cache(maxsize=64)
 def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
-    """Pairs among measured states.
+    """Pairs among measured states, which are given in the order of a plan: displacements first.
 
     Examples
     --------
@@ -39,19 +39,11 @@ def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
     >>> motion_pairs(("y1", "y1_ddot"))
     (MotionPair(first=0, second=1, order=2),)
     """
-    column = {name: number for number, name in enumerate(states)}
     pairs = []
-    for name in states:
-        if name.endswith(("_dot", "_ddot")):
-            continue
-        places = [column.get(name + end) for end in ("", "_dot", "_ddot")]
-        there = [(order, place) for order, place in enumerate(places) if place is not None]
+    for motion in dict.fromkeys(name.removesuffix("_dot").removesuffix("_ddot") for name in states):
+        names = [motion, f"{motion}_dot", f"{motion}_ddot"]
+        there = [(order, states.index(name)) for order, name in enumerate(names) if name in states]
         pairs += [MotionPair(a, b, j - i) for (i, a), (j, b) in pairwise(there)]
-    pairs += [
-        MotionPair(at, column[name.replace("_dot", "_ddot")], 1)
-        for name, at in column.items()
-        if name.endswith("_dot") and name[: -len("_dot")] not in column and name.replace("_dot", "_ddot") in column
-    ]
     return tuple(pairs)
 
 

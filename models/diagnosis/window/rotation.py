@@ -32,10 +32,8 @@ _FEW_HOPS = 6  # fewer hops need lines that stand out by themselves
 _HELD, _HELD_PART = 4, 0.5
 # Strength of a hop's line relative to the other hops' up to which a part of the hop had another speed.
 _WEAKER = 0.25
-LEAST_SETTLED = 0.5
-"""Least part of a window that must be left where a drive goes from one set point to another."""
-STRONG = 15.0
-"""Strength from which a line stands out by itself: no peak of noise is as strong."""
+LEAST_SETTLED = 0.5  # least part of a window that must be left where a drive goes from one set point to another
+STRONG = 15.0  # strength from which a line stands out by itself: no peak of noise is as strong
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +78,9 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     grid_hz = base_hz + base_rate_hz * np.arange(_PADDING * count) / (_PADDING * count)
     inside = np.abs(grid_hz - expected_hz) <= reach_hz
     width = round(_SURROUNDINGS_HZ / (grid_hz[1] - grid_hz[0])) | 1
-    sweeps = _sweeps(expected_hz, duration_s)
+    step_sweep = 2 / duration_s**2  # Hz/s: between two sweeps the phase at the ends is off by less than π/4
+    most = max(1, int(np.ceil(_SWEEP_PER_S * expected_hz / step_sweep)))
+    sweeps = step_sweep * np.arange(-most, most + 1)
     best = (-np.inf, 0.0, 0.0)
     for sweep in sweeps:
         turned = baseband * np.exp(-1j * np.pi * sweep * t_s**2)[:, None]
@@ -95,13 +95,6 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
         frequency_hz, sweep = _climb(baseband, t_s, base_hz, frequency_hz, sweep, step_hz, step_sweep)
         step_hz, step_sweep = step_hz / 2, step_sweep / 2
     return RotationLine(2 * np.pi * frequency_hz, 2 * np.pi * sweep, strength)
-
-
-def _sweeps(expected_hz: float, duration_s: float) -> FloatArray:
-    """Sweeps to try, Hz/s: between two of them the phase at the ends is off by less than π/4."""
-    step = 2 / duration_s**2
-    count = int(np.ceil(_SWEEP_PER_S * expected_hz / step))
-    return np.asarray(step * np.arange(-max(1, count), max(1, count) + 1), dtype=np.float64)
 
 
 def _climb(

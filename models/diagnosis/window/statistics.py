@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.window.equaliser import Equaliser
-from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines
+from models.diagnosis.window.excluded import LOBE, ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
 from models.diagnosis.window.moments import (
     ComplexArray,
     HopMoments,
@@ -25,14 +25,12 @@ from models.diagnosis.window.moments import (
 )
 from models.diagnosis.window.motion import pair_bands
 from models.diagnosis.window.rotation import relative_vectors
-from models.diagnosis.window.stationarity import segment_levels, summed
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # drift of a channel's mean, over its rms, above which every hop's own mean is removed
 _VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
-_LOBE = 2  # bins to either side over which a Hann window spreads a line
 _BESIDE = 3  # bins on either side of a line between whose means the spectra are interpolated
 _SMOOTH = 0.5  # largest ratio of a drift's squared steps from hop to hop to its squared deviations; 2 by chance
 
@@ -188,7 +186,7 @@ class WindowStatistics:
         power = (rest[:, :, np.newaxis] * rest[:, np.newaxis].conj() / 2)[:, np.newaxis]
         gone = np.asarray((turns * power).real, dtype=np.float64)
         step_hz = float(self.frequencies_hz[1] - self.frequencies_hz[0])
-        line = ExcludedLine(abs(self.speed_rad_s) / (2 * np.pi), _LOBE * step_hz)
+        line = ExcludedLine(abs(self.speed_rad_s) / (2 * np.pi), LOBE * step_hz)
         return replace(
             self,
             correlation=self.correlation - gone.mean(axis=0),
@@ -250,9 +248,7 @@ def window_statistics(
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
-        hop_correlation = remove @ through(remove, products) / plan.hop
-        correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
-        hop_correlation, correlation = _undrifted(plan, hops, products, remove, (hop_correlation, correlation))
+        hop_correlation, correlation = _correlations(plan, hops, products, total, remove)
         by_bin = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
@@ -323,10 +319,15 @@ def _shaft_motion(
     window: WindowStatistics, plan: Plan, by_bin: ComplexArray, lost: tuple[str, ...]
 ) -> WindowStatistics:
     """The window of the shaft's motion, from that of the samples; `by_bin` has shape (n_bins, n_segments, n)."""
-    mounted = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
-    shaft = mounted if plan.runout is None else _without_runout(mounted, plan.runout)
-    shaft = shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
-    return replace(shaft.of(plan.states_without(lost)), lost=lost) if lost else shaft
+    window = window if plan.equaliser is None else _equalised(window, plan.equaliser, by_bin)
+    if plan.runout is not None:  # what sensors show at running speed although nothing vibrates
+        known = plan.runout if window.speed_rad_s >= 0 else plan.runout.conj()
+        synchronous, by_hop = (
+            None if one is None else one - known for one in (window.synchronous, window.hop_synchronous)
+        )
+        window = replace(window, synchronous=synchronous, hop_synchronous=by_hop, mounted=window)
+    window = window if plan.turn is None else _turned(window, plan.states, plan.turn)
+    return replace(window.of(plan.states_without(lost)), lost=lost) if lost else window
 
 
 def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexArray) -> WindowStatistics:
@@ -335,9 +336,8 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
     by_hop = by_bin.swapaxes(0, 1).reshape(len(window.waveforms), -1, n_bins, n)
     missing = equaliser.missing(by_hop, window.frequencies_hz, window.lags_s)
     response = equaliser.response(window.frequencies_hz)
-    at_speed, at_speeds = (
-        equaliser.response(np.asarray(speed) / (2 * np.pi)) for speed in (window.speed_rad_s, window.hop_speed_rad_s)
-    )
+    at_speed = equaliser.response(np.asarray(window.speed_rad_s) / (2 * np.pi))
+    at_speeds = equaliser.response(window.hop_speed_rad_s / (2 * np.pi))
     relative = window.relative_synchronous
     return replace(
         window,
@@ -348,17 +348,6 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
         hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous / at_speeds,
         relative_synchronous=None if relative is None else relative_vectors(relative / at_speeds),
         lines=tuple(line.turned(np.diag(1 / equaliser.response(np.array(line.centre_hz)))) for line in window.lines),
-    )
-
-
-def _without_runout(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:
-    """The window without run-out: what sensors show at running speed although nothing vibrates."""
-    known = runout if window.speed_rad_s >= 0 else runout.conj()
-    return replace(
-        window,
-        synchronous=None if window.synchronous is None else window.synchronous - known,
-        hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous - known,
-        mounted=window,
     )
 
 
@@ -384,13 +373,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
 
 
 def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) -> WindowLevels:
-    """Vibration levels of the window that hops make, see `window_levels`.
-
-    Raises
-    ------
-    ValueError
-        If the plan holds none.
-    """
+    """Vibration levels of the window that hops make, see `window_levels`; raises ValueError if none are planned."""
     if plan.levels is None:
         raise ValueError("no levels are planned")
     rotation = rotation_of(plan, hops)
@@ -427,23 +410,19 @@ def _synchronous(beta: FloatArray) -> ComplexArray:
     return np.asarray(beta[..., 1] - 1j * beta[..., 2], dtype=np.complex128)
 
 
-def _undrifted(
-    plan: Plan,
-    hops: tuple[HopMoments, ...],
-    products: FloatArray,
-    remove: FloatArray,
-    usual: tuple[FloatArray, FloatArray],
+def _correlations(
+    plan: Plan, hops: tuple[HopMoments, ...], products: FloatArray, total: FloatArray, remove: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Correlations of every hop, and of all: about each hop's own mean if means drift, otherwise the usual ones.
+    """Correlations of every hop, and of all: about each hop's own mean if means drift, otherwise about their mean.
 
     A drift is no vibration, though it correlates at any lag; means that scatter from hop to hop are no drift.
     """
-    n = len(remove)
+    n, correlation = len(remove), (remove @ total @ remove.T) / (len(hops) * plan.hop)
     means = products[:, 0, n, :n] / plan.hop
     steps, deviations = np.diff(means, axis=0), means - means.mean(axis=0)
     smooth = (steps**2).sum(axis=0) < _SMOOTH * (deviations**2).sum(axis=0)
-    if not np.any(smooth & (np.ptp(means, axis=0) > _DRIFT * np.sqrt(np.abs(np.diag(usual[1][0]))))):
-        return usual
+    if not np.any(smooth & (np.ptp(means, axis=0) > _DRIFT * np.sqrt(np.abs(np.diag(correlation[0]))))):
+        return remove @ through(remove, products) / plan.hop, correlation
     own = np.broadcast_to(remove, (len(hops), *remove.shape)).copy()
     own[:, :, n] = -means - products[:, 0, n, n + 1 :] @ remove[:, n + 1 :].T / plan.hop
     at_hops = np.array([hop.start_ns - hops[0].start_ns for hop in hops]) * 1e-9 * plan.rate_hz / plan.hop

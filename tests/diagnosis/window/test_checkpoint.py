@@ -18,8 +18,7 @@ from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window.moments import plan_for
-from models.diagnosis.window.recall import digest_of
-from models.diagnosis.window.sliding import SlidingWindow
+from models.diagnosis.window.sliding import SlidingWindow, digest_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError
 from models.ingest import Admission, Gate, Reason
@@ -158,7 +157,7 @@ def test_slopes_kept_from_an_earlier_search_are_restored_at_its_speed() -> None:
     line = sure(fit._line)
     search = fit._search(line.model, second, second.speed_rad_s, line.weights.strength)
     found = search.maximise(line.theta, 0, 0.15, 3.0, line.derivatives)
-    assert found.slopes_rad_s == first.speed_rad_s != second.speed_rad_s
+    assert found.derivatives.speed_rad_s == first.speed_rad_s != second.speed_rad_s
     moved = Linearised.around(line.model, search.weights, found)
     again = Linearised.restored(line.model, search.weights, from_bytes(to_bytes(moved.checkpoint())))
     assert_same_bits(again.derivatives.slopes, moved.derivatives.slopes)

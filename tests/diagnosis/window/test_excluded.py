@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines
+from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
 from models.diagnosis.window.moments import ComplexArray
-from models.diagnosis.window.stationarity import segment_levels, summed
 from models.signals.block import FloatArray
 from tests.sure import sure
 
