@@ -23,7 +23,9 @@ from pydantic import AfterValidator, BaseModel, Field, model_validator
 from models.errors import MachineFileError
 
 PREFIX = "rotorwatch"
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+NAME_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+"""Names of sites and machines."""
+
 Topic = Literal["report", "alarm_event", "alarm_state", "health"]
 """What a monitor publishes, by the names of the fields of `MachineKeys`."""
 
@@ -53,7 +55,7 @@ class MachineKeys:
 
     def __post_init__(self) -> None:
         for field, value in (("site", self.site), ("machine", self.machine)):
-            if not _NAME.fullmatch(value):
+            if not re.fullmatch(NAME_PATTERN, value):
                 why = "use 1 to 64 letters, digits, '_' or '-'"
                 raise MachineFileError(f"{field} name {value!r} cannot be part of a key: {why}")
 
@@ -77,7 +79,7 @@ class MachineKeys:
 
 _Flow = Literal["ingress", "egress"]
 _USER = re.compile(r"[^\s:]+")
-_PLACE = re.compile(rf"(\*|{_NAME.pattern})/(\*|{_NAME.pattern})")
+_PLACE = re.compile(rf"(\*|{NAME_PATTERN})/(\*|{NAME_PATTERN})")
 _MODEL = MachineKeys("s", "m")
 
 

@@ -21,6 +21,7 @@ from functools import cached_property
 from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
+from models.signals.keys import NAME_PATTERN
 from rotorwatch.records.health import Health
 from service.analysis.overview import overview
 from service.history.machine import MachineStore
@@ -35,7 +36,7 @@ _AGAIN_S = 1.0
 _PAUSE_S = 0.05
 _LAST_S = 2.0
 _RETRY_MS = 2000
-_ENTRY = r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})"
+_ENTRY = f"({NAME_PATTERN}/{NAME_PATTERN})=(-1|[0-9]{{1,18}})"
 CURSOR_PATTERN = f"^({_ENTRY}(,{_ENTRY})*)?$"
 """Form of the id of an event; each ``site/machine`` is there once."""
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from pydantic import Field
 
 from models.errors import RecordingError
+from models.signals.keys import NAME_PATTERN
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording, writing
 from models.signals.salvage import salvaged_messages
 from models.signals.wire import REPLAY_MARK
@@ -38,10 +39,8 @@ SUFFIX = ".mcap"
 PART = ".part"
 KEPT = "kept.json"
 _NS = 1_000_000_000
-_PLACE = r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
-_PLACE_ONLY = re.compile(_PLACE)
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap(\.part)?")
-_ID = re.compile(rf"(?P<site>{_PLACE})/(?P<machine>{_PLACE})/(?P<file>{_FILE.pattern})")
+_ID = re.compile(rf"(?P<site>{NAME_PATTERN})/(?P<machine>{NAME_PATTERN})/(?P<file>{_FILE.pattern})")
 _STAMP = re.compile(r"(\d{8}T\d{6}Z)")
 _STAMP_FORMAT = "%Y%m%dT%H%M%SZ"
 
@@ -191,10 +190,10 @@ def kept_reasons(folder: Path) -> dict[str, str]:
 
 def _subfolders(folder: Path, name: str | None) -> list[Path]:
     """Folders that may be a site or a machine, sorted, without symbolic links."""
-    entries = [folder / name] if name is not None and _PLACE_ONLY.fullmatch(name) else []
+    entries = [folder / name] if name is not None and re.fullmatch(NAME_PATTERN, name) else []
     if name is None:
         entries = _entries(folder)
-    return [e for e in entries if _PLACE_ONLY.fullmatch(e.name) and e.is_dir() and not e.is_symlink()]
+    return [e for e in entries if re.fullmatch(NAME_PATTERN, e.name) and e.is_dir() and not e.is_symlink()]
 
 
 def _entries(folder: Path) -> list[Path]:

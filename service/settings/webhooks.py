@@ -6,6 +6,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field, model_validator
 
+from models.signals.keys import NAME_PATTERN
 from models.signals.link import is_loopback
 from rotorwatch.records.alarms import EventKind, Severity
 
@@ -14,8 +15,7 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     """One receiver of alarm events; an event is sent if machine, kind and severity are all among those wanted."""
 
     name: str = Field(
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
-        description="name of the webhook; the progress of delivery is kept under it",
+        pattern=f"^{NAME_PATTERN}$", description="name of the webhook; the progress of delivery is kept under it"
     )
     url: str = Field(description="where events are posted: https, or http on this computer")
     insecure: bool = Field(

@@ -13,6 +13,7 @@ from models.alarm_names import ALARMS
 from models.diagnosis.networks.equations import EQUATIONS
 from models.mistakes import form
 from models.physics.rotor import PARAMETERS
+from models.signals.keys import NAME_PATTERN
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
 from rotorwatch.records.history import (
@@ -46,7 +47,6 @@ from service.api.views import (
 from service.stream.monitored import Monitored
 
 _LARGEST = 2**63 - 1
-_PLACE = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 _QUANTITIES = ("parameter", "equation", "level", *MEASURES)
 
 _After = Annotated[
@@ -81,7 +81,7 @@ _Points = Annotated[
     Query(ge=1, le=5000, description="reduce each to at most this many equal buckets instead of single readings"),
 ]
 _OF = form(
-    rf"^{_PLACE}/{_PLACE}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$",
+    rf"^{NAME_PATTERN}/{NAME_PATTERN}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$",
     f"site/machine/quantity/name, where the quantity is one of {', '.join(_QUANTITIES)}",
 )
 _Of = Annotated[str, Query(pattern=_OF)]
