@@ -57,7 +57,7 @@ def cursor_text(cursor: Mapping[str, int]) -> str:
 
 
 def parsed_cursor(text: str) -> Cursor:
-    """Take the id of an event apart; CursorError if it is not one.
+    """Take the id of an event apart; raises `CursorError` if it is not one.
 
     Examples
     --------

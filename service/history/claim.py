@@ -154,7 +154,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
 
 
 def unpack(text: bytes) -> str:
-    """Undo the compression of a report's text; StoreError if the bytes are damaged."""
+    """Undo the compression of a report's text; raises `StoreError` if the bytes are damaged."""
     try:
         return zstandard.ZstdDecompressor(dict_data=_LIKE_REPORTS).decompress(text).decode()
     except (zstandard.ZstdError, UnicodeDecodeError) as error:

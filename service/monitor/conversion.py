@@ -69,6 +69,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
 
 
 def _of_alarm(record: type[Record], alarm: Alarm) -> dict[str, Any]:
+    """Fields of a record that an alarm has under the same name, with its change and the interval of that."""
     change, error = finite(alarm.change), finite(alarm.standard_error)
     interval = None if change is None or error is None else interval_95(change, error, least=-1.0)
     return _shared(record, alarm) | {"relative_change": alarm.change, "interval_95": interval}

@@ -109,7 +109,7 @@ class Evaluation:
         The first suspect is what no change of a parameter makes (`foreign`, empty if nothing). Where the window fits
         badly, channels at the end of their range come next, except `faulty` ones, which the evaluation left out.
         """
-        fits_badly = self.deciding.unexplained or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
+        fits_badly = self.deciding.unexplained != "" or (self.deciding.misfit_z or 0.0) > _MOST_MISFIT_Z
         told = foreign or self.shapes or not fits_badly
         limited = [] if told else at_range_end([window], Naming(channels), faulty)
         ends = f"{'; '.join(limited)}, the end of its range" if limited else ""

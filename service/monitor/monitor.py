@@ -59,7 +59,6 @@ class MachineMonitor:
         self.machine = machine = installed.machine
         self._skips = skips
         self._alarms = AlarmBook(machine.alarms)
-        self.take_events = self._alarms.take  # those that a defect has kept from being handed over
         self._data_path = DataPathAlarms(self._alarms, machine)
         self._reporter = reporter = WindowReporter(installed, self._alarms, self._data_path, remembered=remembered)
         self.identity, self.watching = reporter.identity, reporter.watching
@@ -175,9 +174,10 @@ class MachineMonitor:
         return done
 
     def step(self, block: SampleBlock, schema_hash: str | None = "") -> MonitorReport:
-        """Take one block: gate (which `schema_hash` is for), window, evaluation, alarms.
+        """Take one block: gate, window, evaluation, alarms.
 
-        Refused blocks, gaps and defects of the monitor are stated in the report, never raised.
+        `schema_hash` is that of the channel descriptor which the sender named, see `Gate.judge`. Refused blocks, gaps
+        and defects of the monitor are stated in the report, never raised.
         """
         dropped = self._drops.pop((block.run, block.sequence), 0)
         verdict = self._admission_of(block, schema_hash, dropped)
@@ -256,6 +256,10 @@ class MachineMonitor:
         """Do what an operator asks for, see `AlarmBook.operate`."""
         self._reached_ns = time_ns
         self._alarms.operate(operation, time_ns)
+        return self._alarms.take()
+
+    def take_events(self) -> tuple[AlarmEvent, ...]:
+        """Hand over alarm events that a defect has kept from being handed over."""
         return self._alarms.take()
 
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:

@@ -1,4 +1,4 @@
-"""What a monitor returns: its identity, the result of one block, the machine's health, and the state to restore."""
+"""What a monitor returns: identity, result of one block, health of the machine, and the state to restore, in parts."""
 
 import hashlib
 import json
@@ -108,7 +108,9 @@ class Tally:
 def divided(
     arrays: Mapping[str, np.ndarray], hops: Mapping[int, list[tuple[int, Stretch]]], kept: Collection[str]
 ) -> tuple[bytes, tuple[tuple[str, bytes], ...], tuple[str, ...]]:
-    """State, new parts (not in `kept`) by name, and the names of all parts; the hops are `SequentialState.hops`.
+    """Divide a state so that little of it is written with every hop; the hops are `SequentialState.hops`.
+
+    Returns what is small, new parts (not in `kept`) by name, and the names of all parts.
 
     ::
 

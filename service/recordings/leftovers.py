@@ -96,15 +96,17 @@ def loss_text(salvage: Salvage) -> str:
     if salvage.unnamed_messages:
         texts.append(f"{salvage.unnamed_messages} messages whose key stood in a damaged chunk")
     texts.append(f"{salvage.lost_bytes} bytes that cannot be read")
-    in_memory = (
-        "how much is not known, because the file was written long after the times in it, as an import or a copy is"
-    )
     if salvage.unaccounted_s < _LONGEST_S:
-        in_memory = (
-            f"the file was last written {salvage.unaccounted_s:.3f} s after its last readable message, and up to 1 s "
-            "more was waiting"
+        texts.append(
+            f"what was still in memory: the file was last written {salvage.unaccounted_s:.3f} s after its last "
+            "readable message, and up to 1 s more was waiting"
         )
-    return f"lost: {'; '.join(texts)}; what was still in memory: {in_memory}"
+    else:
+        texts.append(
+            "what was still in memory: how much is not known, because the file was written long after the times in it, "
+            "as an import or a copy is"
+        )
+    return "lost: " + "; ".join(texts)
 
 
 def _set_aside(part: Path) -> None:

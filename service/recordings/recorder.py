@@ -161,7 +161,6 @@ class MachineRecorder:
         self._log = logger(part="recorder", machine=machine.title)
         self._limiter = Limiter(clock)
         self._backlog = Backlog(round(settings.queue_mb * 1e6), machine.keys.stream)
-        self.put = self._backlog.put  # takes a message; never waits, and never fails because of the disk
         self._catalogue = Catalogue(self.directory)
         self._pending: deque[RecordedMessage] = deque()  # taken out of the backlog, not written yet
         self._unsafe: deque[RecordedMessage] = deque()  # written, in a chunk that is not complete
@@ -176,10 +175,9 @@ class MachineRecorder:
         self._status = RecorderStatus(machine.site, machine.name)
         self._give_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder {self.folder}", daemon=True)
-        self.start = self._thread.start
 
     def prepare(self) -> None:
-        """Make the folder and take it for this recorder; its thread does it as well, and tries again if it fails.
+        """Make the folder and take it for this recorder; `start` does it as well, and tries again if it fails.
 
         Raises `RecordingError` if the folder cannot be made or written, or another recorder writes there.
         """
@@ -187,6 +185,14 @@ class MachineRecorder:
             with writing(self.folder):
                 self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = lock(self.folder)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def put(self, message: RecordedMessage) -> None:
+        """Take a message; never waits, and never fails because of the disk."""
+        self._backlog.put(message)
 
     def stop(self) -> None:
         """Write what waits, close the file, and end the thread; what cannot be written by then is given up."""

@@ -101,9 +101,9 @@ class RemoteMachine:
     @property
     def not_monitored(self) -> str:
         """Why the latest known state does not count any more; empty if it does."""
-        if self.down or time.monotonic() - self._told_s <= _SILENT_S:
-            return self.down
-        return f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
+        if not self.down and time.monotonic() - self._told_s > _SILENT_S:
+            return f"the process that monitors it has not responded for more than {_SILENT_S:g} s"
+        return self.down
 
     @property
     def identity(self) -> Identity:

@@ -41,11 +41,7 @@ class EvidenceCollector:
                 self._generation, self._calm_ns = self._worker.history.generation, None
             elif self._looked_ns is None and (before := self._calm_picture()) is not None:
                 self._calm_ns = before.report.end_ns
-            raised = {
-                (one.name, one.occurrence): one
-                for one in health.alarms
-                if one.raised and one.evidence is not None and alarm_kind(one.name).about == "machine"
-            }
+            raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}
             self._standing = {key: kept for key, kept in self._standing.items() if key in raised}
             for key, alarm in raised.items():
                 if key not in self._standing or self._standing[key] is not None:
@@ -65,24 +61,23 @@ class EvidenceCollector:
 
     def _keep(self, kept: AlarmEvidence | None, alarm: Alarm, report: Report) -> AlarmEvidence | None:
         """Keep the pictures that an alarm still lacks; return its evidence, or None once that is complete."""
-        history = self._worker.history
-        # Whether the window holds no data from before the change.
-        is_later = alarm.raised_ns is not None and report.start_ns >= alarm.raised_ns
-        settled = is_later if report.verdict is None else report.verdict.settled
+        history, settled = self._worker.history, _is_settled(alarm, report)
         if kept is None and (text := history.evidence(alarm.name, alarm.occurrence)):  # from before a restart
             kept = AlarmEvidence.model_validate_json(text)
         if kept is None or (settled and kept.settled is None):
             now = self._picture(report)
-            kept = kept or AlarmEvidence(
-                site=report.site,
-                machine=report.machine,
-                name=alarm.name,
-                occurrence=alarm.occurrence,
-                before=self._calm_picture(),
-                raised=now,
-                settled=None,
-            )
-            kept = kept.model_copy(update={"settled": now if settled else None})
+            if kept is None:
+                kept = AlarmEvidence(
+                    site=report.site,
+                    machine=report.machine,
+                    name=alarm.name,
+                    occurrence=alarm.occurrence,
+                    before=self._calm_picture(),
+                    raised=now,
+                    settled=now if settled else None,
+                )
+            else:
+                kept = kept.model_copy(update={"settled": now})
             history.keep_evidence(alarm.name, alarm.occurrence, kept.model_dump_json())
         return kept if kept.settled is None else None
 
@@ -107,8 +102,19 @@ def _measured(found: CorrelationSnapshot) -> CorrelationSnapshot:
     return found.model_copy(update={"pairs": pairs, "theory": theory.model_copy(update=reasons)})
 
 
+def _rests_on_a_window(alarm: Alarm) -> bool:
+    return alarm.raised and alarm.evidence is not None and alarm_kind(alarm.name).about == "machine"
+
+
 def _is_calm(health: Health, report: Report) -> bool:
     quiet = not any(alarm.present or alarm.pending for alarm in health.alarms)
     verdict = report.verdict
     same = verdict is None or (verdict.settled and not verdict.detected)
     return quiet and same and report.filled >= 1 and report.state in _CALM
+
+
+def _is_settled(alarm: Alarm, report: Report) -> bool:
+    """Whether a window holds no data from before the change."""
+    if report.verdict is not None:
+        return report.verdict.settled
+    return alarm.raised_ns is not None and report.start_ns >= alarm.raised_ns

@@ -1,4 +1,4 @@
-"""From the network to a machine's thread: what takes the messages of all machines, and the queue of one machine."""
+"""From the network to a machine's thread: one intake for all machines, and a queue for each, of blocks and of calls."""
 
 import threading
 from collections import deque

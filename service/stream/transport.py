@@ -222,6 +222,7 @@ class MachineLink:
         encoding, info = str(sample.encoding), sample.source_info
         if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            # The publisher's session and its number there; empty if its messages are not numbered.
             source = "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
             self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, source))
 

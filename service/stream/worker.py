@@ -111,7 +111,6 @@ class MachineWorker:
         self._outlet: Callable[[Topic, str], None] | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._pulse = Pulse(self.inbox.call, self._tick)
-        self.tick = self._pulse.beat  # lets the thread notice that time passes; to be called every now and then
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.title}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
@@ -268,6 +267,10 @@ class MachineWorker:
         except TimeoutError as error:
             then = "nothing was done" if done.cancel() else "look at the alarm before trying again"
             raise NotInTime(f"{self.machine.title}: busy for {_OPERATION_S:g} s; {then}") from error
+
+    def tick(self) -> None:
+        """Let the machine's thread notice that time passes, with data or without; called every now and then."""
+        self._pulse.beat()
 
     def _data_now_ns(self) -> int:
         return self._time.now_ns(self._monitor.end_ns)

@@ -265,7 +265,10 @@ class Dispatcher:
 
 
 class Webhooks:
-    """Starts and stops webhooks and reports their states; MachineFileError if a secret or certificate is unusable."""
+    """Starts and stops webhooks and reports their states.
+
+    Raises `MachineFileError` if a secret or certificate cannot be used.
+    """
 
     def __init__(self, webhooks: Sequence[WebhookSettings]) -> None:
         self._receivers = [(settings, Receiver(settings)) for settings in webhooks]

@@ -33,7 +33,7 @@ def new_secret() -> str:
 
 
 def parse_secret(text: str) -> bytes:
-    """The key in a secret; MachineFileError if it is none, whose message does not show it."""
+    """The key in a secret; raises `MachineFileError`, which does not show the text, if it is none."""
     encoded = text.removeprefix(PREFIX)
     try:
         key = base64.b64decode(encoded, validate=True)

@@ -82,22 +82,23 @@ class AlarmEvent:
         return f"{self.kind.value.replace('-', ' ')}{who}: {what}{why}"
 
     def _about_condition(self, what: str) -> str:
-        alarm, kind = self.alarm, alarm_kind(self.alarm.name)
+        alarm, texts = self.alarm, alarm_kind(self.alarm.name)
         if alarm.name not in PARAMETER_TEXT:
             if self.kind is EventKind.CLEARED:
-                return f"cleared: {kind.cleared}"
-            said = alarm.note or kind.raised
+                return f"cleared: {texts.cleared}"
+            said = alarm.note or texts.raised
             return f"{alarm.severity.upper()}: {what}" + (f": {said}" if said else "")
         half = Z95 * (alarm.standard_error or 0.0)
         digits = percent_digits(half)
         size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
         reserve = " (low confidence: another cause is possible)" if alarm.low_confidence else ""
-        if self.kind is not EventKind.CLEARED:
-            how = "by" if self.kind is EventKind.RAISED else "further, now"
-            return f"{alarm.severity.upper()}: {what} changed {how} {size}{reserve}"
+        if self.kind is EventKind.RAISED:
+            return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"
+        if self.kind is EventKind.ESCALATED:
+            return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
         if alarm.taken_back:
             return f"cleared: {what} is no longer named as changed; it reads {size}"
-        return f"cleared: {what} is back {kind.cleared} at {size}"
+        return f"cleared: {what} is back {texts.cleared} at {size}"
 
 
 KIND_OF_EVENT: dict[OperationKind, EventKind] = {

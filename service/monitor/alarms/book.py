@@ -311,8 +311,14 @@ class AlarmBook:
     def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for, at the data time that has been reached.
 
-        Raises `UnknownAlarm`, `OperationConflict`, and `OperationRefused` also if a reason is missing or the time is
-        too long.
+        Raises
+        ------
+        UnknownAlarm
+            If there is no such alarm.
+        OperationConflict
+            If the alarm is no longer as the operator saw it.
+        OperationRefused
+            If it is in a state in which this cannot be done, a reason is missing, or the time is too long.
         """
         if not is_alarm(operation.alarm):
             raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
