@@ -233,8 +233,8 @@ def _gap_lines(done: Imported) -> Iterator[str]:
     yield f"gaps: {len(gaps)}, {lasting(total_s)} in all, kept as gaps" if gaps else "gaps: none"
     for gap in gaps[:_LISTED]:
         file = f" of {gap.file}" if done.read.files > 1 else ""
-        length, begin_ns = lasting((gap.to_ns - gap.from_ns) / 1e9), done.clock.origin_ns + round(gap.from_ns)
-        yield f"  before row {gap.row + 1}{file}: {length} from {rfc3339(begin_ns)}"
+        begin_ns = done.clock.origin_ns + round(gap.from_ns)
+        yield f"  before row {gap.row + 1}{file}: {lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(begin_ns)}"
     if len(gaps) > _LISTED:
         yield f"  and {len(gaps) - _LISTED} more"
     if done.read.filled:
