@@ -82,7 +82,7 @@ class _Message:
 
 @dataclass(slots=True)
 class _Follower:
-    """Subscriptions to the alarms of machines, and queries to their monitors.
+    """Subscribes to the alarms of machines, and queries their monitors for what was missed.
 
     A lost connection is restored automatically, but messages published meanwhile are missed. Latest states and events
     cached by monitors are delivered at once, possibly out of order and repeatedly.
@@ -189,7 +189,10 @@ class _Follower:
                 return
 
     def _page(self, order: LogOrder) -> str | None:
-        """Query a monitor's alarm log: JSON of an `AlarmLogPage`, or None without an answer within five seconds."""
+        """Query a monitor's alarm log: JSON of an `AlarmLogPage`.
+
+        None if nobody answers within five seconds, or the monitor cannot read its log; the first time with a warning.
+        """
         page, trouble = None, "nobody answers"
         selector = f"{_PREFIX}/{order.place}/alarm/event?after={order.ask_after};limit={_PAGE}"
         for reply in self._session.get(selector, timeout=_ANSWER_S):

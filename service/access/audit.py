@@ -90,8 +90,14 @@ class AuditTrail:
         try:
             self._write(visit, status, note)
         except RotorwatchError as error:
-            told = {"actor": visit.actor, "method": visit.method, "path": _short(visit.path), "status": status}
-            _log.error("outcome is missing from the audit log", **told, why=str(error))
+            _log.error(
+                "outcome is missing from the audit log",
+                actor=visit.actor,
+                method=visit.method,
+                path=_short(visit.path),
+                status=status,
+                why=str(error),
+            )
 
     def admits_refusal(self, network: str) -> int | None:
         """How many refusals were left out before this one, or None if this one is to be left out as well."""

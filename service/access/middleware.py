@@ -6,7 +6,7 @@ Written against ASGI itself, so that event streams pass through piece by piece.
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 
-from fastapi import Request
+from fastapi import Request, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
@@ -88,11 +88,7 @@ class AccessMiddleware:
 
         async def refuse(refusal: HTTPException) -> None:
             request.state.audit = AuditNote(reason=refusal.detail)
-            answer = problem_answer(request, refusal.status_code, refusal.detail)
-            answer.headers.update(refusal.headers or {})
-            for challenge in challenges(request) if refusal.status_code == HTTPStatus.UNAUTHORIZED else ():
-                answer.headers.append("WWW-Authenticate", challenge)
-            await answer(scope, receive, watched)
+            await _refusal(request, refusal)(scope, receive, watched)
 
         try:
             caller = await self._admitted(request, visit)
@@ -133,3 +129,12 @@ class AccessMiddleware:
         elif visit.method in SAFE_METHODS:
             return
         await run_in_threadpool(self._trail.finish, visit, status, note)
+
+
+def _refusal(request: Request, refusal: HTTPException) -> Response:
+    answer = problem_answer(request, refusal.status_code, refusal.detail)
+    answer.headers.update(refusal.headers or {})
+    if refusal.status_code == HTTPStatus.UNAUTHORIZED:
+        for challenge in challenges(request):
+            answer.headers.append("WWW-Authenticate", challenge)
+    return answer

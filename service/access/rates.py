@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 
 _MINUTE_S = 60.0
 _KEYS = 10_000
-_SEATS_RETRY = {"Retry-After": "5"}
+_SEATS_RETRY_S = 5
 
 
 class MovingWindow:
@@ -82,13 +82,10 @@ class StreamSeats:
         HTTPException
             429 if there is none; the message says whether the caller has too many streams or the service.
         """
-        text = ""
         if self._taken[key] >= self._per_caller:
-            text = f"{self._per_caller} of your event streams are open, the most allowed: close one"
-        elif self.taken >= self._total:
-            text = f"{self._total} event streams are open, the most this service allows"
-        if text:
-            raise HTTPException(429, text, _SEATS_RETRY)
+            raise _full(f"{self._per_caller} of your event streams are open, the most allowed: close one")
+        if self.taken >= self._total:
+            raise _full(f"{self._total} event streams are open, the most this service allows")
         self._taken[key] += 1
         try:
             yield
@@ -96,3 +93,7 @@ class StreamSeats:
             self._taken[key] -= 1
             if not self._taken[key]:
                 del self._taken[key]
+
+
+def _full(text: str) -> HTTPException:
+    return HTTPException(429, text, {"Retry-After": str(_SEATS_RETRY_S)})

@@ -41,9 +41,12 @@ def nearness(report: Report) -> dict[str, float]:
 
     The page chooses what it shows of a machine by the same rule (``monitor/states.js``).
     """
-    verdict, detectable = report.verdict, {one.name: one for one in report.detectable}
+    current: Iterable[Parameter] = ()
+    if report.verdict is not None:
+        current = report.parameters if report.verdict.settled else report.verdict.current
+    detectable = {one.name: one for one in report.detectable}
     near: dict[str, float] = {}
-    for read in () if verdict is None else report.parameters if verdict.settled else verdict.current:
+    for read in current:
         change = read.relative_change
         if change is not None and read.standard_error is not None:
             seen = detectable.get(read.name)

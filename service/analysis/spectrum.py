@@ -205,12 +205,13 @@ def _used(data: Sampled, channels: Sequence[Channel], window_s: float, segment: 
 def read_full_spectrum(
     data: Sampled, pairs: Sequence[tuple[Channel, Channel]], window_s: float, resolution_hz: float, *, orders: bool
 ) -> FullSpectrum:
-    """Full spectra of the latest `window_s` that were recorded.
+    """Full spectra of the latest `window_s` that were recorded; RotorwatchError if the shaft does not turn.
 
     Parameters
     ----------
     orders : bool
-        Order spectrum: samples are resampled at equal shaft angles, so that a changing speed does not smear the lines.
+        Order spectrum: samples are resampled at equal shaft angles, so that a changing speed does not smear the lines;
+        MachineFileError without a shaft angle.
     """
     if orders and not data.has_angle:
         raise MachineFileError(f"{data.place}: --axis orders needs the shaft angle (keyphasor), which is not measured")

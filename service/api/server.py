@@ -1,6 +1,6 @@
-"""The HTTP server, which runs in its own thread, and limits on its connections: number, and waits for clients.
+"""The HTTP server, in its own thread; how many connections it holds, and how long each may keep it waiting.
 
-uvicorn has no such limits (docs/decisions/0022-http-connections.md). Connections are counted when they are accepted, so
+uvicorn limits neither (docs/decisions/0022-http-connections.md). Connections are counted when they are accepted, so
 that those whose TLS handshake never ends count too, and are checked a few times per second::
 
     handshake --> head --> body --> answering --> head ...

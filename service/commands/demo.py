@@ -141,8 +141,9 @@ class Outcome:
 def run_demo(fault: str, seed: int, pace: float, once: bool, http_port: int | None) -> int:
     """Run the demo for one fault (`once`) or until interrupted; `fault` is one of `FAULTS`, or "none".
 
-    Port 0 takes free ports, for Zenoh too; None takes the usual ports if they are free. The exit code is 0 if exactly
-    the injected parameter was named, 1 if not, and 130 if interrupted.
+    `seed` is that of the simulation (training used no small seeds), `pace` is data seconds per second. `once` also ends
+    a demo without a fault, after the same time. Port 0 takes free ports, for Zenoh too; None takes the usual ports if
+    they are free. The exit code is 0 if exactly the injected parameter was named, 1 if not, and 130 if interrupted.
 
     Raises
     ------

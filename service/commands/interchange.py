@@ -99,9 +99,10 @@ def export(
     from_ns, to_ns = _nanoseconds("--from", from_), _nanoseconds("--to-time", to_time)
     table = write(Selection(tuple(recordings), machine, from_ns, to_ns, si), what, to, out, overwrite=overwrite)
     typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
-    more = [f"{len(table.skipped) - _LISTED} more"] if len(table.skipped) > _LISTED else []
-    for text in table.skipped[:_LISTED] + more:
+    for text in table.skipped[:_LISTED]:
         typer.echo(f"left out: {text}", err=True)
+    if len(table.skipped) > _LISTED:
+        typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
 
 
 def _nanoseconds(option: str, text: str | None) -> int | None:

@@ -183,8 +183,10 @@ def replay(
             for change in set_ or ():
                 if "=" not in change:
                     raise MachineFileError(f"--set {change!r}: expected FIELD=VALUE, as alarms.on_delay_s=60")
-            changes, tasks = "\n".join(set_ or ()), []
-            for one in (source.machine(key),) if ray is None else machines:
+            changes = "\n".join(set_ or ())
+            chosen = (source.machine(key),) if ray is None else machines
+            tasks = []
+            for one in chosen:
                 recorded = source.paths_between(from_ns, to_ns, frozenset({one.stream}))
                 tasks.append(MachineTask(f"{one.site}/{one.machine}", recorded, wanted(one), changes, from_ns, to_ns))
             if ray is None:

@@ -264,10 +264,10 @@ def test_webhook(
     from service.delivery.webhooks.dispatcher import send_test  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
-    webhooks = load_settings(config).webhooks
-    settings = next((webhook for webhook in webhooks if webhook.name == name), None)
+    known = load_settings(config).webhooks
+    settings = next((webhook for webhook in known if webhook.name == name), None)
     if settings is None:
-        there = ", ".join(webhook.name for webhook in webhooks) or "none"
+        there = ", ".join(webhook.name for webhook in known) or "none"
         raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
     took_s = send_test(settings)
     typer.echo(f"{name}: {settings.target} accepted the test event, in {took_s:.2f} s")

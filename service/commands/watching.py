@@ -72,11 +72,11 @@ def watch(
     base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
     ends = {"connect": tuple(connect)} if connect else {}
     settings = in_namespace(base.model_copy(update=ends), namespace)
-    lines = _Lines()
+    lines = None if as_json else _Lines()
 
     def show(message: "TopicMessage") -> None:
         try:
-            if as_json:
+            if lines is None:
                 sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
             else:
                 lines.show(message)

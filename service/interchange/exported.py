@@ -99,7 +99,13 @@ class Table:
 
 
 def stream_table(selection: Selection) -> Table:
-    """Samples, one row per instant: ``time_ns`` and a column per channel, gaps kept."""
+    """Samples, one row per instant: ``time_ns`` and a column per channel, gaps kept.
+
+    Raises
+    ------
+    RecordingError
+        If there is no stream or no descriptor, or the channels change within the recordings.
+    """
     root = selection.root()
     descriptor = _descriptor(selection, f"{root}/descriptor")
     fields = [_field("time_ns", pa.int64(), "ns", "acquisition time since 1970-01-01 UTC")]
@@ -246,11 +252,14 @@ def _stream_batches(
 def _batch(
     pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.floating]]], factors: Sequence[float], table: Table
 ) -> pa.RecordBatch:
-    times, samples = map(np.concatenate, zip(*pending, strict=True))
+    times = np.concatenate([time_ns for time_ns, _ in pending])
+    samples = np.concatenate([rows for _, rows in pending])
     columns = [pa.array(times)]
-    for field_, column, factor in zip(list(table.schema)[1:], samples.T, factors, strict=True):
+    for number, factor in enumerate(factors):
+        column = samples[:, number]
         values = column if factor == 1.0 else column.astype(np.float64) * factor
-        columns.append(pa.array(np.ascontiguousarray(values, dtype=field_.type.to_pandas_dtype())))
+        kind = table.schema.field(number + 1).type.to_pandas_dtype()
+        columns.append(pa.array(np.ascontiguousarray(values, dtype=kind)))
     table.rows += times.size
     return pa.record_batch(columns, schema=table.schema)
 

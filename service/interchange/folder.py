@@ -191,13 +191,18 @@ def unusable(files: Sequence[SnapshotFile], mapping: Mapping, machine: MachineFi
         except SourceError as error:
             faults[file.path] = error
     if machine.schedule is not None and isinstance(mapping.time.start, datetime):
-        forms = {re.sub(r"\d+", "0", file.path.name) for file in files if file.path not in faults}
+        forms = {_form(file.path) for file in files if file.path not in faults}
         for path, fault in faults.items():
-            if forms and re.sub(r"\d+", "0", path.name) not in forms:
+            if forms and _form(path) not in forms:
                 raise SourceError(
                     f"{fault}; whether it counts among the others its name does not say: move it out of the folder"
                 )
     return faults
+
+
+def _form(path: Path) -> str:
+    """A file's name, the same for all numbers in it."""
+    return re.sub(r"\d+", "0", path.name)
 
 
 def runs_of_pulses(

@@ -169,10 +169,14 @@ def summary_lines(done: Imported) -> Iterator[str]:
     several = f"{read.files} files, " if read.files > 1 else ""
     if read.shortest < read.longest:
         several = f"{read.files} files of {read.shortest} to {read.longest} rows, "
-    channels, span = len(machine.sensors), f"{rfc3339(written.start_ns)} to {rfc3339(written.end_ns)}"
-    rows = f"{several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz"
-    yield f"{done.source}: {rows}, {channels} channels of {machine.title}"
-    yield f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {span}"
+    yield (
+        f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
+        f"{len(machine.sensors)} channels of {machine.title}"
+    )
+    yield (
+        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
+        f"{rfc3339(written.end_ns)}"
+    )
     yield from done.doubts
     yield from _folder_lines(done)
     yield from _gap_lines(done)
@@ -228,8 +232,9 @@ def _gap_lines(done: Imported) -> Iterator[str]:
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
     yield f"gaps: {len(gaps)}, {lasting(total_s)} in all, kept as gaps" if gaps else "gaps: none"
     for gap in gaps[:_LISTED]:
-        file, begun_ns = f" of {gap.file}" if done.read.files > 1 else "", done.clock.origin_ns + round(gap.from_ns)
-        yield f"  before row {gap.row + 1}{file}: {lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(begun_ns)}"
+        file = f" of {gap.file}" if done.read.files > 1 else ""
+        begin_ns = done.clock.origin_ns + round(gap.from_ns)
+        yield f"  before row {gap.row + 1}{file}: {lasting((gap.to_ns - gap.from_ns) / 1e9)} from {rfc3339(begin_ns)}"
     if len(gaps) > _LISTED:
         yield f"  and {len(gaps) - _LISTED} more"
     if done.read.filled:
@@ -289,7 +294,7 @@ def _angle_lines(done: Imported) -> Iterator[str]:
         return
     operation = done.machine.operation
     if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
-        yield (f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed")
+        yield f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed"
 
 
 def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:

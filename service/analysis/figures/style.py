@@ -114,7 +114,8 @@ def heading(figure: Figure, look: Look, title: str, span_ns: tuple[int, int], *d
     first, last = (clock(time_ns) for time_ns in span_ns)
     when = f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
     figure.suptitle(look.title or title, x=0.012, y=0.995, ha="left", va="top", fontsize=11.5, fontweight="bold")
-    height, text = figure.get_figheight(), "   ·   ".join(filter(None, (when, *details)))
+    height = figure.get_figheight()
+    text = "   ·   ".join(filter(None, (when, *details)))
     figure.text(0.012, 1 - 0.27 / height, text, ha="left", va="top", color=GREY)
     engine = figure.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):

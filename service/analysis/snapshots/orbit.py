@@ -36,7 +36,10 @@ class _Vectors:
 
 
 def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions."""
+    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions.
+
+    Raises SnapshotError if these are negative or too many.
+    """
     machine, known, window = subject.machine, subject.known, data.window
     there = orbit_pairs(machine.sensors)
     pairs = [pair for pair in there if not data.missing & {state_name(one) for one in pair}]
@@ -120,7 +123,10 @@ def _path_orbit(pair: tuple[Channel, Channel], excerpt: Excerpt | None, path: Pa
         motion = np.array([path.y, path.z], dtype=np.float64)
         q = 2 * (motion * np.exp(-1j * excerpt.angle_rad)).mean(axis=1)
         ellipse = _ellipse(q, _Vectors(q, q[None], -1 if excerpt.speed_rad_s < 0 else 1, absolute=True))
-    return _window_orbit(pair, None, None, (), path, units).model_copy(update={"ellipse": ellipse})
+    unit = "m" if units == "SI" else pair[0].unit
+    return PlaceOrbit(
+        location=pair[0].location, unit=unit, y=None, z=None, ellipse=ellipse, nominal=None, estimated=None, path=path
+    )
 
 
 def _vector(name: str, column: int, vectors: _Vectors, factor: float) -> RunningSpeedVector:

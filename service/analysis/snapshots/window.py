@@ -142,7 +142,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
 ) -> SpectrumSnapshot:
     """Power spectral densities of channels, see `chosen_channels`, and cross-spectra and coherence of named pairs.
 
-    The band is limited to that of the machine file.
+    The band is limited to that of the machine file; SnapshotError if it holds too few lines.
     """
     machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     chosen = chosen_channels(machine, channels)

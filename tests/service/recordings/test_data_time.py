@@ -150,7 +150,7 @@ def test_a_replay_is_limited_by_data_times(quick: Path, tmp_path: Path, options:
     assert found.exit_code == 0, found.output
     lines = [ReplayLine.model_validate_json(line) for line in found.stdout.splitlines()]
     summary, progress = sure(lines[-1].summary), sure(lines[-2].progress)
-    assert (summary.blocks, progress.fraction) == (count, 1.0), summary_lines(summary)
+    assert (summary.blocks, progress.fraction) == (count, 1.0), list(summary_lines(summary))
     assert abs(progress.position_ns - START_NS - (15 if count == 30 else 40) * S) <= 1
 
 
