@@ -71,7 +71,7 @@ def reversed_signs(window: WindowStatistics) -> str:
     rotor changes their lengths, too. Empty if nothing of the kind is seen.
     """
     vectors = window.hop_synchronous
-    if vectors is None or len(vectors) < 3 or window.removed_by_hop or not vectors.any(axis=1).all():
+    if vectors is None or len(vectors) < 3 or window.removed_by_hop or not vectors.all():
         return ""
     unit = vectors / np.abs(vectors).mean(axis=0)
     scatter = np.median(np.abs(np.diff(unit, axis=0)), axis=0)
