@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.baseline.stored import Baseline
@@ -198,6 +198,12 @@ class ConditionBaseline(BaseModel, extra="forbid", frozen=True):
 
     conditions: OperatingRange
     baseline: Baseline
+
+    @field_validator("baseline")
+    @classmethod
+    def _can_be_read_back(cls, baseline: Baseline) -> Baseline:
+        """Refuse numbers that are not finite: those of a baseline that has just been learned are not checked before."""
+        return Baseline.model_validate_json(json.dumps(baseline.model_dump()))
 
 
 class Commissioned(BaseModel, extra="forbid", frozen=True):
