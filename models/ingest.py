@@ -181,7 +181,11 @@ class Gate:
         return self.form(block, schema_hash) is None
 
     def judge(self, block: SampleBlock, schema_hash: str | None = "") -> Admission:
-        """Accept or refuse a block; the schema hash is None if the block's `form` has been found right before."""
+        """Accept or refuse a block.
+
+        The schema hash is the one that the sender named, empty if it named none; None if the block's `form` has been
+        found right before.
+        """
         return (None if schema_hash is None else self.form(block, schema_hash)) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:

@@ -225,8 +225,10 @@ class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             named += [(f"events.{number}.{field}", name) for number, name in of_events if name is not None]
         for field, name in named:
             if name not in known:
-                others = f"machine {machine.name} ({', '.join(known)}){did_you_mean(name, known)}"
-                raise MachineFileError(f"scenario {self.name}: {field}: {name!r} is not a channel of {others}")
+                raise MachineFileError(
+                    f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
+                    f"({', '.join(known)}){did_you_mean(name, known)}"
+                )
         for number, event in enumerate(self.events):
             if event.sensor is None or event.swapped_with is None:
                 continue

@@ -144,8 +144,9 @@ class LevelJudge:
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
         has grown, or a random part whose kurtosis departs from that of the healthy machine.
 
-        The latest hop is added to `latest`. If it is `named` which parameter has changed, a finding would cast doubt on
-        that; sensors in `faulty` columns show neither the machine nor a gain.
+        `judged` is what `judge` returned for the window; its latest hop is added to `latest`, the ones before. `named`
+        says whether a parameter has been found to have changed, which a finding would cast doubt on. Sensors in
+        `faulty` columns show neither the machine nor a gain.
         """
         if reference is None:
             return Foreign()
