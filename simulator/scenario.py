@@ -174,8 +174,9 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
         if self.swapped_with == self.sensor:
             raise ValueError(f"swapped_with is {self.swapped_with!r}, expected another channel than {self.sensor!r}")
         if self.sensor_fault == "delay" and not 0 <= (self.value_SI or 0.0) <= LONGEST_DELAY_S:
-            expected = f"0 to {LONGEST_DELAY_S:g} s"
-            raise ValueError(f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected {expected}")
+            raise ValueError(
+                f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected 0 to {LONGEST_DELAY_S:g} s"
+            )
         if self.sensor_fault in ("noise_relative", "clip") and (self.value_SI or 0.0) < 0:
             raise ValueError(f"value_SI of sensor_fault {self.sensor_fault!r} is {self.value_SI}, expected 0 or more")
         if self.ramp_s > 0 and self.sensor_fault not in _WITH_RAMP:

@@ -101,8 +101,10 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     def _known_unit_and_place(self) -> Self:
         units = UNIT_TO_SI[self.quantity]
         if self.unit not in units:
-            known_units = f"{', '.join(units)} for {self.quantity}{did_you_mean(self.unit, units)}"
-            raise ValueError(f"channel {self.name}: unit {self.unit!r} is not one of {known_units}")
+            raise ValueError(
+                f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
+                f"{did_you_mean(self.unit, units)}"
+            )
         if self.angle_deg is not None:
             self._check_angle(self.angle_deg)
         elif (self.quantity, self.location, self.direction) in _STATE_NAMES:
