@@ -123,8 +123,9 @@ def checked(
     fits = len(array.shape) == len(shape) and all(size in (None, found) for size, found in sizes)
     if not fits or array.dtype.type is not kind:
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        has = f"type {array.dtype} and shape {array.shape}"
-        raise CheckpointError(f"{name} has {has}, expected {kind.__name__} and ({wanted})")
+        raise CheckpointError(
+            f"{name} has type {array.dtype} and shape {array.shape}, expected {kind.__name__} and ({wanted})"
+        )
     return array
 
 

@@ -181,7 +181,11 @@ class Gate:
         return self.form(block, schema_hash) is None
 
     def judge(self, block: SampleBlock, schema_hash: str | None = "") -> Admission:
-        """Accept or refuse a block; the schema hash is None if the block's `form` has been found right before."""
+        """Accept or refuse a block.
+
+        The schema hash is the one that the sender named, empty if it named none; None if the block's `form` has been
+        found right before.
+        """
         return (None if schema_hash is None else self.form(block, schema_hash)) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -214,9 +218,8 @@ class Gate:
         settings, channels, which = self._settings, self._channels, f"block {block.sequence}"
         n_samples, n_channels = block.samples.shape
         if schema_hash and schema_hash != self._schema_hash:
-            hashes = f"hash {schema_hash}, expected {self._schema_hash}"
-            text = f"the stream's channel descriptor has {hashes} for channels {', '.join(channels)}"
-            return self._refuse(Reason.CHANNELS, text)
+            text = f"the stream's channel descriptor has hash {schema_hash}, expected {self._schema_hash} for channels "
+            return self._refuse(Reason.CHANNELS, text + ", ".join(channels))
         if n_channels != len(channels):
             text = f"{which} has {n_channels} channels, expected {len(channels)} ({', '.join(channels)})"
             return self._refuse(Reason.CHANNELS, text)
@@ -247,17 +250,16 @@ class Gate:
             self._follow(block)
             return Admission()
         if any(course.covers(block) for course in self._earlier):
-            when = "before the publisher restarted or its clock was set"
-            return self._refuse(Reason.OVERLAP, f"{which} of run {block.run} was received {when}: a repetition")
+            text = f"{which} of run {block.run} was received before the publisher restarted or its clock was set"
+            return self._refuse(Reason.OVERLAP, f"{text}: a repetition")
         if any(course.covers(block) for course in self._refused):
             return self._refuse(Reason.OVERLAP, f"{which} was refused before: a repetition")
         late_ns, restarted = block.start_ns - expected.start_ns, block.run != expected.run
         missed = 0 if restarted else block.sequence - expected.sequence
         if abs(late_ns) <= self._tolerance_ns:
             if missed:
-                in_time = "in a block that continues the previous one in time"
-                text = f"sequence is {block.sequence} {in_time}, expected {expected.sequence}"
-                return self._resynchronise(block, Reason.SEQUENCE, text)
+                text = f"sequence is {block.sequence} in a block that continues the previous one in time, expected "
+                return self._resynchronise(block, Reason.SEQUENCE, text + str(expected.sequence))
             self._follow(block)
             return Admission(text=f"{self._name}: the publisher restarted") if restarted else Admission()
         late_s = late_ns / 1e9

@@ -224,11 +224,12 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        for fault in chain(self._faults_of_window(), self._faults_of_names(), self._faults_of_signals()):
-            raise ValueError(fault)
+        for fault in chain(self._faults_of_window(), self._faults_of_levels(), self._faults_of_signals()):
+            raise ValueError(fault)  # the first one: the others may follow from it
         return self
 
     def _faults_of_window(self) -> Iterator[str]:
+        """Names that make no keys, windows that do not fit the sampling, and sensors that show nothing in them."""
         window, rate_hz = self.window, self.rate_hz
         try:
             MachineKeys(self.site, self.name)
@@ -277,7 +278,8 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             silence = f"the silence between snapshots, {schedule.silence_s:g} s"
             yield f"ingest.no_data_after_s is {self.ingest.no_data_after_s:g}, expected more than {silence}"
 
-    def _faults_of_names(self) -> Iterator[str]:
+    def _faults_of_levels(self) -> Iterator[str]:
+        """Limits and alarms of levels that no channel has; raises ValueError if two channels are the same."""
         _ = self.descriptor  # refuses duplicate channels
         names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
         from models.levels.limits import unmeasured  # noqa: PLC0415  # it imports scipy, for which no --help waits
@@ -290,6 +292,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 yield f"alarms: {name}: no channel of that name; there are {', '.join(names)}"
 
     def _faults_of_signals(self) -> Iterator[str]:
+        """High-passes and delays that take too much of the band or of a segment."""
         begin_hz, most_us = self.window.band_hz[0], 1e6 * _MOST_OF_SEGMENT * self.window.segment_s
         for sensor in self.sensors:
             corner_hz = sensor.high_pass_hz or 0.0

@@ -287,7 +287,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def argument_text(error: Exception) -> str | None:
-    """What was expected of an argument of a command, if the cause of its refusal are the checks of fields of files."""
+    """What was expected of an argument of a command, if a check of a field of a file is the cause of its refusal."""
     cause = error.__cause__
     return expectation(cause.errors(include_url=False)[0]) if isinstance(cause, ValidationError) else None
 

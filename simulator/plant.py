@@ -221,7 +221,7 @@ class NonlinearPlant(Plant):
             self._start_revolution, self._since_change = 0.0, 0
 
     def advance(self, n_samples: int) -> PlantSamples:
-        """Return the next `n_samples` samples and move on."""
+        """Return the next `n_samples` samples and move on; EstimationError if friction makes the disc unstable."""
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)
         theta = self._angles(n_samples)
@@ -301,8 +301,10 @@ class NonlinearPlant(Plant):
             turn = transition @ turn
         largest = float(np.max(np.abs(np.linalg.eigvals(turn))))
         if largest >= 1:
-            grows = f"the motion grows by a factor of {largest:.4g} a turn at {self._speed_rpm:g} rpm, expected below 1"
-            raise EstimationError(f"machine {self._machine.name}: a crack of {depth:g} is unstable, {grows}")
+            raise EstimationError(
+                f"machine {self._machine.name}: a crack of {depth:g} is unstable, the motion grows by a factor of "
+                f"{largest:.4g} a turn at {self._speed_rpm:g} rpm, expected below 1"
+            )
 
 
 class _Contact:

@@ -298,8 +298,12 @@ def _progress(duration_s: float, key: str) -> Iterator[Callable[["RunSummary"], 
             progress.update(task, completed=summary.data_s, pace=summary.pace, truth=escape(truth))
             if summary.heard is not None and summary.heard != heard:
                 heard = summary.heard
-                no = f"{key} has no subscriber: is a monitor running (rotorwatch run), and is it at the address given"
-                say(f"{key} now has a subscriber" if heard else f"{no} by --connect?")
+                say(
+                    f"{key} now has a subscriber"
+                    if heard
+                    else f"{key} has no subscriber: is a monitor running (rotorwatch run), and is it at the address "
+                    "given by --connect?"
+                )
             if progress.disable and summary.elapsed_s >= next_s:
                 next_s = summary.elapsed_s + _LINE_S
                 done = f"{summary.data_s:.1f} of {duration_s:.1f} s of data"

@@ -174,8 +174,9 @@ class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
         if self.swapped_with == self.sensor:
             raise ValueError(f"swapped_with is {self.swapped_with!r}, expected another channel than {self.sensor!r}")
         if self.sensor_fault == "delay" and not 0 <= (self.value_SI or 0.0) <= LONGEST_DELAY_S:
-            expected = f"0 to {LONGEST_DELAY_S:g} s"
-            raise ValueError(f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected {expected}")
+            raise ValueError(
+                f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected 0 to {LONGEST_DELAY_S:g} s"
+            )
         if self.sensor_fault in ("noise_relative", "clip") and (self.value_SI or 0.0) < 0:
             raise ValueError(f"value_SI of sensor_fault {self.sensor_fault!r} is {self.value_SI}, expected 0 or more")
         if self.ramp_s > 0 and self.sensor_fault not in _WITH_RAMP:
@@ -225,8 +226,10 @@ class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
             named += [(f"events.{number}.{field}", name) for number, name in of_events if name is not None]
         for field, name in named:
             if name not in known:
-                others = f"machine {machine.name} ({', '.join(known)}){did_you_mean(name, known)}"
-                raise MachineFileError(f"scenario {self.name}: {field}: {name!r} is not a channel of {others}")
+                raise MachineFileError(
+                    f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
+                    f"({', '.join(known)}){did_you_mean(name, known)}"
+                )
         for number, event in enumerate(self.events):
             if event.sensor is None or event.swapped_with is None:
                 continue

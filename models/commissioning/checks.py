@@ -167,8 +167,10 @@ def check_steady(
             worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, np.finfo(float).tiny)))))
             if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
                 channel = with_channel_names(windows[recording.name][0].as_mounted.states[worst], machine.sensors)
-                found = f"is {round(ratio[worst], 6):.2g} times that of the first"
-                moved.append(f"{recording.name}: the random vibration of {channel} in the second half {found}")
+                moved.append(
+                    f"{recording.name}: the random vibration of {channel} in the second half is "
+                    f"{round(ratio[worst], 6):.2g} times that of the first"
+                )
     if not moved:
         return told(verdict="passed", text="speed and level are steady within every recording")
     advice = "record in steady operation: one file for each speed or load, each of at least two windows"
@@ -287,8 +289,10 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
         text = f"noise that makes a channel {seen[least]:.2g} times as loud ({least}) is reported as a changed shape"
     if not blind:
         return told(verdict="passed", text=text)
-    loud = f"{', '.join(blind)} {SEEN_GROWTH:g} times as loud"
-    text += f"; with {windows} healthy windows not even noise that makes {loud} is reported"
+    text += (
+        f"; with {windows} healthy windows not even noise that makes {', '.join(blind)} {SEEN_GROWTH:g} times as loud "
+        "is reported"
+    )
     wanted = max((one.windows or 0 for one in blind.values()), default=0)
     if wanted <= windows:
         advice = "set limits for the levels yourself: the healthy signal of these channels is noise-like"
@@ -308,7 +312,8 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
 def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: str | None = None) -> Check:
     """Check whether healthy windows agree with the reference that they were read against.
 
-    `what` is it in words, such as "the parameters in the machine file"; by default it is the other half of the data.
+    `what` names the reference, such as "the parameters in the machine file"; without it, that is the other half of the
+    data.
     """
     name, between = "halves agree", "between the halves of the healthy data"
     if what is not None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.baseline.stored import Baseline
@@ -82,8 +82,10 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
                 "channel is only compared with its own healthy form"
             )
     elif lacking := [name for name in _GEOMETRY if name in rotor.unknown]:
-        without = "without masses and shaft it cannot be used at all"
-        text = f"[rotor] lacks {', '.join(lacking)}: {without}, and everything is learned from the recordings"
+        text = (
+            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft it cannot be used at all, and everything is "
+            "learned from the recordings"
+        )
     elif rotor.unknown:
         level, names = KnowledgeLevel.PARTIAL, ", ".join(rotor.unknown)
         text = f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: {names}"
@@ -145,8 +147,10 @@ class OperatingRange(BaseModel, extra="forbid", frozen=True):
             low, high = self.rms[name]
             if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
                 found, least, most = (naming.value(name, each) for each in (value, low, high))
-                seen = f"{least} to {most}, and up to {LEVEL_MARGIN:g} times less or more"
-                return f"random vibration of {naming.name(name)} is {found} rms, commissioned at {seen}"
+                return (
+                    f"random vibration of {naming.name(name)} is {found} rms, commissioned at {least} to {most}, and "
+                    f"up to {LEVEL_MARGIN:g} times less or more"
+                )
         return ""
 
 
@@ -198,6 +202,12 @@ class ConditionBaseline(BaseModel, extra="forbid", frozen=True):
 
     conditions: OperatingRange
     baseline: Baseline
+
+    @field_validator("baseline")
+    @classmethod
+    def _can_be_read_back(cls, baseline: Baseline) -> Baseline:
+        """Refuse numbers that are not finite: those of a baseline that has just been learned are not checked before."""
+        return Baseline.model_validate_json(json.dumps(baseline.model_dump()))
 
 
 class Commissioned(BaseModel, extra="forbid", frozen=True):

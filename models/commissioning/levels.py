@@ -179,20 +179,15 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         shape = learn_shape(windows)
     except EstimationError as error:
         no_shape = str(error)
-    why = advice = ""
     if too_slow:
         why = f"a sampling rate of {machine.rate_hz:g} Hz allows no equation"
-        advice = f"sample at {math.ceil(1 / longest_s)} Hz or faster"
+        check = _no_equations(why, no_shape, f"sample at {math.ceil(1 / longest_s)} Hz or faster")
     elif all(reason for _, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))):
-        why = "these sensors allow no equation"
-        sensors = "a displacement, velocity or acceleration at the bearing and at the disc in that plane"
-        advice = f"for the bearing in one plane: {sensors}"
-    if why:
-        if shape is None:
-            check = Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
-            return Learned((check,))
-        text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
-        check = Check(name="equations", verdict="limited", text=text, advice=advice)
+        advice = (
+            "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in "
+            "that plane"
+        )
+        check = _no_equations("these sensors allow no equation", no_shape, advice)
     else:
         try:
             return replace(_with_relations(machine, pieces, progress), shape=shape)
@@ -200,8 +195,18 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
             if shape is None:
                 raise
             check = check_determined([str(error)], only_shapes=True)
+    if shape is None:
+        return Learned((check,))
     powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
     return Learned((check, check_shapes(machine, powers, shape.windows)), shape=shape)
+
+
+def _no_equations(why: str, no_shape: str, advice: str) -> Check:
+    """No relation can be learned; `no_shape` says why no channel's shape can be either, empty if it can."""
+    if no_shape:
+        return Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
+    text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
+    return Check(name="equations", verdict="limited", text=text, advice=advice)
 
 
 _LINEAR = (

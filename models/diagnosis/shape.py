@@ -133,12 +133,16 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         z = -float(ndtri(min(max(p, _LEAST_P), 1 - 1e-16)))
         figures = f"{z:.1f} standard deviations, limit {limit:.1f}"
         if p < rate:
-            seen = f"its correlation function has changed shape ({figures})"
-            unsure = "this comparison cannot tell whether the machine or its excitation has"
-            return stated(verdict="changed", z=z, text=f"{one.channel}: {seen}; {unsure}")
+            text = (
+                f"{one.channel}: its correlation function has changed shape ({figures}); this comparison cannot tell "
+                "whether the machine or its excitation has"
+            )
+            return stated(verdict="changed", z=z, text=text)
         if not _power(one, self.windows, np.array(self.lags_s), rate).growth <= SEEN_GROWTH:
-            unseen = f"not even noise that makes it {SEEN_GROWTH:g} times as loud would change its shape beyond chance"
-            text = f"{one.channel}: not evaluable, with {self.windows} healthy windows {unseen}"
+            text = (
+                f"{one.channel}: not evaluable, with {self.windows} healthy windows not even noise that makes it "
+                f"{SEEN_GROWTH:g} times as loud would change its shape beyond chance"
+            )
             return stated(verdict="not evaluable", z=z, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
         return stated(verdict="not changed", z=z, text=text)

@@ -144,8 +144,9 @@ class LevelJudge:
         A shaft that is pushed back where it is far out, a new line, a wrong gain of all sensors of a place, a 2x that
         has grown, or a random part whose kurtosis departs from that of the healthy machine.
 
-        The latest hop is added to `latest`. If it is `named` which parameter has changed, a finding would cast doubt on
-        that; sensors in `faulty` columns show neither the machine nor a gain.
+        `judged` is what `judge` returned for the window; its latest hop is added to `latest`, the ones before. `named`
+        says whether a parameter has been found to have changed, which a finding would cast doubt on. Sensors in
+        `faulty` columns show neither the machine nor a gain.
         """
         if reference is None:
             return Foreign()
@@ -340,9 +341,9 @@ class LevelJudge:
     ) -> LevelLimits:
         """On which side of its limits a level is; `out` is the text for a 1x vector out of its acceptance region."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
-        if 0 < danger.danger <= value:
+        if _reached(danger.danger, value):
             state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
-        elif 0 < alert.alert <= value:
+        elif _reached(alert.alert, value):
             state, decided, what = "alert", alert, f"alert limit {alert.alert:.3g} ({alert.source})"
             if alert.source == _X1_VECTOR:
                 what = out
@@ -390,9 +391,14 @@ def _nearest_limits(name: str, limits: Sequence[Limit]) -> _Nearest:
         state="normal",
         bounds=tuple(one.bound() for one in limits if one.source != _X1_VECTOR) if several else (),  # no level's limit
     )
-    # A limit of nothing, as of a dead channel, is shown and not judged by.
+    # A limit of nothing is shown and not judged by, see `_reached`.
     high = min((edge for edge in (alert.alert, danger.danger) if edge > 0), default=math.inf)
     return _Nearest(alert, danger, fall, normal, fall.fall, high)
+
+
+def _reached(limit: float, value: float) -> bool:
+    """Whether a level has reached a limit: not one of nothing, as of a dead channel, nor one that is not there."""
+    return 0 < limit <= value and limit != math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,8 @@ A limit relative to a reference is never nearer than a quarter above the largest
 errors of one window above the mean. So excitation that varies as it did in the healthy windows raises nothing, and a
 line where there was only noise has to stand out of it. While a window fills, its levels scatter more: the limits allow
 for that about the loudest and the quietest healthy level as well as about the mean.
+
+A limit of a machine file on a level that its sensors can never give would guard nothing: `unmeasured` finds it.
 """
 
 import math

@@ -37,8 +37,9 @@ _LEAST_SHARE = 0.02
 def learn_lines(windows: Sequence[FloatArray], bands: BandLevels, hops: float, unsteady: float) -> FloatArray:
     """Largest share of each band's power that one bin has in healthy windows, shape (n_bands, n); 1 where it may grow.
 
-    Windows have the share of the strongest bin of a hop, shape (n_bands, n), and are the mean of so many hops; `bands`
-    are those of one of them, `unsteady` is the largest range of the speed over the hops of one, relative to the speed.
+    Each window holds the share of each band's power that the strongest bin of a hop has, shape (n_bands, n), as the
+    mean of `hops` hops. `bands` are those of one window; `unsteady` is the largest range of the speed over the hops of
+    a window, relative to the speed.
     """
     largest = np.asarray(np.max(windows, axis=0), dtype=np.float64)
     if unsteady > _STEADY:

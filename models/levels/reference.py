@@ -213,8 +213,9 @@ class FirstWindows:
     still: the first windows in which it turns become a second reference. It `turns` if rotation can be detected, by a
     shaft angle or near a nominal speed.
 
-    Windows do not overlap. Operators read `since` when they count, empty if from the beginning. `of` identifies what
-    the levels depend on: a reference of another machine, or other settings, is not restored.
+    The `count` windows do not overlap. `since` says from when they are, as operators will read it; it is empty if they
+    are from the beginning. `of` identifies what the levels depend on: a reference of another machine, or other
+    settings, is not restored.
     """
 
     def __init__(

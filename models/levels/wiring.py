@@ -27,7 +27,8 @@ _MEDIAN_STEP = 1.1774  # median length of a hop-to-hop step over the standard de
 def rewired(vectors: ComplexArray, healthy: ComplexArray, channels: Sequence[Channel]) -> SensorFault | None:
     """Find places that show each other's healthy 1x vectors, or reversed ones, while all others show their own.
 
-    `vectors`, shape (n_hops, n), are those in the hops of a window; `healthy`, shape (n,), those at the same speed.
+    `vectors`, shape (n_hops, n), are the 1x vectors of the channels in the hops of a window; `healthy`, shape (n,),
+    those of the healthy machine at the same speed.
     """
     places: dict[str, list[int]] = {}
     for column, channel in enumerate(channels):

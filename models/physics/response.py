@@ -30,8 +30,9 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     """
     fastest = float(np.linalg.eigvals(A).real.max())
     if fastest >= 0:
-        found = f"an eigenvalue has real part {fastest:.3g} 1/s, expected below 0"
-        raise EstimationError(f"the system is unstable: {found}")
+        raise EstimationError(
+            f"the system is unstable: an eigenvalue has real part {fastest:.3g} 1/s, expected below 0"
+        )
     _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     inputs = B / scale[:, None]
     rough = scipy.linalg.solve_continuous_lyapunov(A * (scale / scale[:, None]), -inputs @ inputs.T)

@@ -101,8 +101,10 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     def _known_unit_and_place(self) -> Self:
         units = UNIT_TO_SI[self.quantity]
         if self.unit not in units:
-            known_units = f"{', '.join(units)} for {self.quantity}{did_you_mean(self.unit, units)}"
-            raise ValueError(f"channel {self.name}: unit {self.unit!r} is not one of {known_units}")
+            raise ValueError(
+                f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
+                f"{did_you_mean(self.unit, units)}"
+            )
         if self.angle_deg is not None:
             self._check_angle(self.angle_deg)
         elif (self.quantity, self.location, self.direction) in _STATE_NAMES:
@@ -128,9 +130,10 @@ class Channel(BaseModel, extra="forbid", frozen=True):
                 f"expected it with {', '.join(_RATES)} only"
             )
         if _cardinal(angle_deg) != {"y": 0, "z": 1}.get(self.direction, _cardinal(angle_deg)):
-            both = f"direction {self.direction!r} and angle_deg {angle_deg:g}"
-            advice = "give the direction the name it has on the machine, such as X or Y"
-            raise ValueError(f"channel {self.name}: {both} contradict each other; {advice}")
+            raise ValueError(
+                f"channel {self.name}: direction {self.direction!r} and angle_deg {angle_deg:g} contradict each other; "
+                "give the direction the name it has on the machine, such as X or Y"
+            )
 
     @property
     def axis(self) -> tuple[float, float]:
@@ -235,12 +238,16 @@ def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
                 "more are watched at a place with another name"
             )
         if others:
-            beside = f"measures y or z of {location} beside {said}, which are resolved into them"
-            raise ValueError(f"channel {' and '.join(others)}: {beside}; expected two sensors of a quantity at a place")
+            raise ValueError(
+                f"channel {' and '.join(others)}: measures y or z of {location} beside {said}, which are resolved into "
+                "them; expected two sensors of a quantity at a place"
+            )
         apart = apart_deg(channels[angled[0]], channels[angled[1]])
         if apart < LEAST_APART_DEG - 1e-9:
-            least = f"at least {LEAST_APART_DEG:g}°: two sensors that point the same way cannot tell y from z"
-            raise ValueError(f"channels {said}: their axes are {round(apart, 1):g}° apart, expected {least}")
+            raise ValueError(
+                f"channels {said}: their axes are {round(apart, 1):g}° apart, expected at least {LEAST_APART_DEG:g}°: "
+                "two sensors that point the same way cannot tell y from z"
+            )
         first, second = angled
         nearer = abs(channels[second].axis[0]) > abs(channels[first].axis[0]) + 1e-9
         found.append((second, first) if nearer else (first, second))
@@ -374,8 +381,10 @@ def unit_factor(quantity: str, unit: str) -> float:
     accepted = f"expected one of {', '.join(known)}"
     detected = _DETECTED.search(spelled)
     if detected and _spelled(spelled[: detected.start()]) in {name for units in _UNITS.values() for name in units}:
-        what = f"is that of an overall value ({detected.group(1)}), but waveform samples are needed"
-        raise ValueError(f"unit {unit!r} {what}: they have no peak-to-peak or rms unit; {accepted}")
+        raise ValueError(
+            f"unit {unit!r} is that of an overall value ({detected.group(1)}), but waveform samples are needed: they "
+            f"have no peak-to-peak or rms unit; {accepted}"
+        )
     others = [name for name, units in _UNITS.items() if spelled in units]
     if others:
         raise ValueError(f"unit {unit!r} is a unit of {' or '.join(others)}, not of {quantity}; {accepted}")

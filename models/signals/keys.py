@@ -134,7 +134,10 @@ class Grant(BaseModel, extra="forbid", frozen=True):
 
 
 def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert_common_names"]) -> dict[str, object]:
-    """Zenoh's ``access_control`` for these grants, with names of one kind: what none of them allows is dropped."""
+    """Zenoh's ``access_control`` for these grants: what none of them allows is dropped.
+
+    `known_by` says what the names in `Grant.who` are.
+    """
     rules: list[dict[str, object]] = []
     allowed: dict[str, list[str]] = {}
     for grant in grants:

@@ -299,8 +299,10 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
         else:
             reasons.append("the other side requires a user name, and link.user has none")
         if self._encrypted(self.connect) and self.tls is not None:
-            invalid = f"was not issued by {self.tls.root_certificate}, has expired"
-            reasons.append(f"the other side's certificate {invalid}, or is for another name than the endpoint's")
+            reasons.append(
+                f"the other side's certificate was not issued by {self.tls.root_certificate}, has expired, or is for "
+                "another name than the endpoint's"
+            )
             if self.tls.mutual:
                 reasons.append(f"{self.tls.certificate} was not issued by the authority trusted there, or has expired")
             else:
@@ -386,8 +388,10 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
             return lines[0].strip()
         password = os.environ.get(self.password_variable or "", "")
         if not password:
-            empty = f"the environment variable {self.password_variable} is empty or not set"
-            raise MachineFileError(f"link.password_variable: {empty}, expected the password of user {self.user}")
+            raise MachineFileError(
+                f"link.password_variable: the environment variable {self.password_variable} is empty or not set, "
+                f"expected the password of user {self.user}"
+            )
         return password
 
 

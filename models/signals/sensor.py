@@ -48,8 +48,9 @@ class Sensor(Channel):
             why = f"run-out is that of a displacement, and this measures {self.quantity}"
             raise ValueError(f"channel {self.name}: slow_roll_um_pp is {self.slow_roll_um_pp:g}, but {why}")
         if self.high_pass_order is not None and self.high_pass_hz is None:
-            order = f"high_pass_order is {self.high_pass_order}"
-            raise ValueError(f"channel {self.name}: {order} without high_pass_hz, its corner")
+            raise ValueError(
+                f"channel {self.name}: high_pass_order is {self.high_pass_order} without high_pass_hz, its corner"
+            )
         given = [name for name in ("high_pass_hz", "delay_us") if getattr(self, name) is not None]
         if given and self.quantity is Quantity.SHAFT_ANGLE:
             raise ValueError(f"channel {self.name}: {given[0]} is given, but this measures {self.quantity}")

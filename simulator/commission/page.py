@@ -79,8 +79,8 @@ def _spectra_caption(portraits: Sequence[Portrait]) -> str:
     else:
         text += "The speed is not known, so the rotation is neither marked nor taken out."
     if any(one.lines for one in portraits):
-        where = "at the channel where it is strongest"
-        text += f" A frequency in orange is a steady line that does not belong to the rotation, {where}."
+        text += " A frequency in orange is a steady line that does not belong to the rotation, "
+        text += "at the channel where it is strongest."
     return text
 
 

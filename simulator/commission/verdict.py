@@ -190,8 +190,10 @@ def next_steps(report: CommissioningReport) -> tuple[str, ...]:
     steps.append("Start the monitor with the machine file and this bundle: rotorwatch run --machine FILE@BUNDLE.")
     short = [one.name for one in report.parameters if dominant(one) == "commissioning"]
     if short:
-        why = "what was learned is less certain than one window"
-        steps.append(f"For sharper readings of {listed(short)}, commission again from more healthy data: {why}.")
+        steps.append(
+            f"For sharper readings of {listed(short)}, commission again from more healthy data: what was learned is "
+            "less certain than one window."
+        )
     steps.append("Commission again after a repair, rebalancing or a change of sensors, and for other speeds or loads.")
     return tuple(steps)
 

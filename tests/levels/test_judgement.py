@@ -199,6 +199,13 @@ def test_every_limit_that_applies_to_a_level_is_listed() -> None:
     assert "bounds" not in several["crest"].model_dump()
 
 
+def test_a_level_beyond_all_numbers_reaches_only_limits_that_are_there() -> None:
+    own = [{"channel": "DE-H", "measure": "overall", "alert": 4.0}]
+    found = limits(judged(CASING, window(overall=np.inf), limits=own))["overall"]
+    assert (found.state, found.danger) == ("alert", None)
+    assert found.text.endswith("inf mm/s rms, alert limit 4 (own limit)")
+
+
 def test_a_channel_clears_only_below_the_deadband() -> None:
     settings: dict[str, Any] = {"limits": [{"channel": "DE-H", "alert": 10.0}]}
     for level, beyond, small in ((10.5, True, False), (9.5, False, False), (8.9, False, True)):

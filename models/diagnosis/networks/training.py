@@ -171,6 +171,8 @@ def train_networks(
         Number of windows in all batches together, for the schedule of the learning rate.
     log_range : float or ndarray, shape (6,)
         Largest drawn logarithmic ratio of each of `PARAMETERS`.
+    seed : int
+        For the initial weights and the choice from the buffer.
     progress : callable
         Called with the number of windows of each batch.
 

@@ -70,9 +70,9 @@ def excluded_lines(
 
     `segments` has shape (n_bins, n_segments, n), and `spectrum`, (n_bins, n, n), are their cross-spectra in any unit.
     The speeds are those of the slowest and the fastest hop; where they are nan, or the shaft stands, no line can be
-    told from the rotation. Without `known`, the lines of the healthy machine, all lines count as such, multiples of the
-    speed too. `turning`, (n_segments, n_bins), is the cosine of the shaft angle, and `alive`, (n,), says which channels
-    have a signal: the rounding errors of a dead one look like lines anywhere.
+    told from the rotation. `known` are the lines of the healthy machine; if None, all lines count as such, multiples of
+    the speed too. `turning`, (n_segments, n_bins), are Fourier coefficients of the cosine of the shaft angle. `alive`,
+    (n,), says which channels have a signal: the rounding errors of a dead one look like lines anywhere.
     """
     if alive is not None and not alive.all():
         place = np.eye(alive.size)[:, alive]

@@ -303,7 +303,8 @@ class SlidingWindow:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue where `checkpoint` was called; without moments the window `lacks` its samples until recalled.
 
-        Nothing is changed if the arrays are refused: also if a hop is missing or does not fit the plan.
+        Raises CheckpointError if an array is missing or of another form, a hop is missing, or it does not fit the plan;
+        nothing is changed then.
         """
         level = checked(arrays, "level", np.float64, (None,))
         if level.size not in (0, len(self.plan.states)):

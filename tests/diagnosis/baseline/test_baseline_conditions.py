@@ -11,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from benchmarks.finite_elements.rotor import changed_rotor
+from models.commissioning.commissioned import ConditionBaseline, OperatingRange
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
 from models.diagnosis.baseline.learned import disagreements, learn_baseline, undetermined
 from models.diagnosis.baseline.rows import ROWS, learned_rows
@@ -87,6 +88,20 @@ def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
     assert (one.parameters, one.misfit_z) == (other.parameters, other.misfit_z)
     for a, b in ((one.covariance, other.covariance), (one.common, other.common)):
         assert np.array_equal(sure(a), sure(b))
+
+
+def test_a_baseline_with_a_number_that_is_not_finite_is_not_stored() -> None:
+    learned, conditions = baseline(), OperatingRange.of(recorded(ROTOR, Excitation(), 81, 2))
+    stored = ConditionBaseline(conditions=conditions, baseline=learned)
+    assert stored.baseline == learned
+    first, second = learned.relations
+    for damage in (
+        {"relations": (replace(sure(first), misfit=math.nan), second)},
+        {"relations": (replace(sure(first), coefficients=sure(first).coefficients * np.inf), second)},
+        {"covariance": learned.covariance * np.nan},
+    ):
+        with pytest.raises(ValidationError, match="finite number"):
+            ConditionBaseline(conditions=conditions, baseline=learned.model_copy(update=damage))
 
 
 @pytest.mark.parametrize(
