@@ -9,6 +9,7 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 import math
 from collections.abc import Mapping
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -53,7 +54,7 @@ _LINE_ERROR = 0.01  # least relative error of e if the angle is that of a line f
 # Standard deviation of the hops' speeds, relative, above which the theory is averaged over two speeds. With one source
 # and sensor noise of 0.3 %, the mean speed alone fits at 0.16 % and misfits by 7 standard errors at 0.32 %.
 _WANDERS = 0.002
-_MISFITS = 6  # windows in a row that misfit before the next one is searched cold: they may all share a wrong maximum
+_MISFITS = 4  # windows in a row that misfit before one is searched cold as well, and the better maximum kept
 _FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
 _Band = tuple[FloatArray, npt.NDArray[np.bool_]]
@@ -90,10 +91,8 @@ class LikelihoodFit:
         self._misfits = 0
 
     def start_near(self, other: "LikelihoodFit") -> None:
-        """Start the next window where another fit of the same machine has ended, cold if that misfits."""
-        self.reset()
-        if not other._misfits:
-            self._last, self._strength = other._last, other._strength
+        """Start the next window where another fit of the same machine has ended."""
+        self._last, self._strength, self._line = other._last, other._strength, None
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""
@@ -159,9 +158,19 @@ class LikelihoodFit:
         UnexplainedError
             If the search finds no maximum, or nothing within the model comes near the window.
         """
-        if self._misfits == _MISFITS:
-            self.reset()
         window = integrated(window)
+        found = self._searched(window)
+        if self._misfits and self._misfits % _MISFITS == 0:  # perhaps all of them have ended at a wrong maximum
+            cold = copy(self)
+            cold.reset()
+            with suppress(EstimationError):
+                other = cold._searched(window)
+                if not other.unexplained and (other.misfit_z or 0.0) < (found.misfit_z or 0.0):
+                    vars(self).update(vars(cold))
+                    return other
+        return found
+
+    def _searched(self, window: WindowStatistics) -> Diagnosis:
         speed, speeds = self._speed(window), self._speeds(window)
         band = window.frequencies_hz, _near_lines(window, speed)
         scale = np.sqrt(self._checked_power(window, ~band[1]))

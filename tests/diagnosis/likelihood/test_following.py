@@ -17,7 +17,7 @@ from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event
 from simulator.stream import blocks
-from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_window
 from tests.service.rig.foreign import Foreign, as_blocks, foreign
 from tests.sure import sure
 from tests.windows import full_windows, last_window
@@ -60,6 +60,21 @@ def test_following_and_glancing_agree_with_a_full_search(layout: Layout) -> None
         (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
         assert np.all(np.abs(glanced - searched) < 0.8 * error)
         np.testing.assert_allclose(glanced_error, error, rtol=0.15)
+
+
+def test_after_windows_that_misfit_a_better_maximum_is_searched_from_scratch() -> None:
+    """Searches that begin where the last one ended may stay near a wrong maximum, as after a change."""
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT, faults={"c_bz": -0.3})
+    window, fit = simulate_window(draw, 0), LikelihoodFit(LAB)
+    right, remembered = fit.diagnose(window), fit.checkpoint()
+    remembered["last"][:5] += [0.5, -0.5, -1.5, 0.2, 0.1]
+    found = []
+    for misfits in (0, 3):
+        remembered["followed"][2] = misfits
+        fit.restore(remembered)
+        found.append(fit.diagnose(window))
+    assert sure(found[0].misfit_z) > 4
+    assert found[1].parameters == right.parameters
 
 
 def test_a_glance_is_refused_after_a_change_and_before_the_first_search() -> None:

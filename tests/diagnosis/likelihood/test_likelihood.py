@@ -207,16 +207,6 @@ def test_a_wrong_gain_and_an_added_mass_cause_a_misfit() -> None:
     assert (LikelihoodFit(LAB).diagnose(simulate_window(mass, 0)).misfit_z or 0) > 3
 
 
-def test_windows_that_misfit_are_searched_cold_again() -> None:
-    """All searches from one wrong maximum may end there: not more than six in a row, and none of a shorter length."""
-    window = simulate_window(UnusualDraw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT), 0)
-    fit, short = LikelihoodFit(LAB), LikelihoodFit(LAB)
-    found = [fit.diagnose(window) for _ in range(6)]
-    short.start_near(fit)
-    assert all(later.steps < found[0].steps for later in found[1:])
-    assert found[0].parameters == fit.diagnose(window).parameters == short.diagnose(window).parameters
-
-
 def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT)
     first, second = simulate_window(draw, 0), simulate_window(draw, 1)
