@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine
+from models.signals.block import nanoseconds
 from models.signals.link import LinkSettings, load_link
 from simulator.commands import Commands, VersionOption, finite
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
@@ -238,15 +239,12 @@ def _pace(text: str) -> float | None:
 
 def _time_ns(text: str) -> int:
     try:
-        moment = datetime.fromisoformat(text)
+        start_ns = nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
         raise MachineFileError(f"--start is {text!r}, expected ISO 8601 such as 2026-01-01T00:00:00Z") from error
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    epoch = datetime(1970, 1, 1, tzinfo=UTC)
-    if not epoch <= moment < datetime(2262, 1, 1, tzinfo=UTC):
+    if not 0 <= start_ns < nanoseconds(datetime(2262, 1, 1, tzinfo=UTC)):
         raise MachineFileError(f"--start is {text!r}, expected a time from 1970 to 2261")
-    return (moment - epoch) // timedelta(microseconds=1) * 1000
+    return start_ns
 
 
 @contextmanager

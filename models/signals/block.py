@@ -10,12 +10,19 @@ Butterworth high-pass that is run forwards and backwards, 1 / (1 + (f_c / f)⁸)
 
 from collections import deque
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 SampleArray = npt.NDArray[np.float32] | FloatArray
+
+
+def nanoseconds(moment: datetime) -> int:
+    """A date and time, UTC if it names no zone, in nanoseconds since 1970-01-01 UTC."""
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return since // timedelta(microseconds=1) * 1000
 
 
 @dataclass(frozen=True, slots=True)

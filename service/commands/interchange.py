@@ -1,6 +1,6 @@
 """``rotorwatch import`` and ``rotorwatch export``: recordings from and to files of other programs."""
 
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -109,9 +109,9 @@ def _nanoseconds(option: str, text: str | None) -> int | None:
     """Parse an ISO 8601 time to nanoseconds since 1970; a time without a zone is UTC."""
     if text is None:
         return None
+    from models.signals.block import nanoseconds  # noqa: PLC0415  # keeps --help quick
+
     try:
-        time = datetime.fromisoformat(text)
+        return nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
         raise MachineFileError(f"{option} is {text!r}, expected a time such as 2026-01-31T12:00:00Z (UTC)") from error
-    since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since // timedelta(microseconds=1)) * 1000

@@ -4,7 +4,7 @@ One TOML file; ``docs/interchange.md`` explains each field.
 """
 
 import re
-from datetime import UTC, datetime, timedelta, tzinfo
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from zoneinfo import ZoneInfo
@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, Field, model_validator
 from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
+from models.signals.block import nanoseconds
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from models.signals.sensor import Sensor
 from service.interchange.source import Format, Source, SourceError
@@ -118,7 +119,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
             return None
         if not isinstance(self.start, datetime):
             return _ZEROS_NS[self.start]
-        return (self.start - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+        return nanoseconds(self.start)
 
 
 class Column(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):

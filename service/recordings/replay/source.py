@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from models.errors import MachineFileError, RecordingError, WireError
+from models.signals.block import nanoseconds
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.recording import RecordedMessage, RecordingSummary, read_recording, summarize_recording
 from models.signals.wire import decode_block
@@ -374,15 +375,12 @@ def parse_moment(text: str, start_ns: int, option: str) -> int:
     if _SECONDS.fullmatch(text):
         return start_ns + round(float(text.strip("+s")) * 1e9)
     try:
-        moment = datetime.fromisoformat(text)
+        return nanoseconds(datetime.fromisoformat(text))
     except ValueError as error:
         raise MachineFileError(
             f"{option} is {text!r}, expected seconds after the start of the data, such as 90, "
             "or a time such as 2026-01-01T00:02:30Z"
         ) from error
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def clock(time_ns: int) -> str:
