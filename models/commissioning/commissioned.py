@@ -284,7 +284,7 @@ def in_sense(machine: Machine, sense: Gyroscopic) -> Machine:
 
 def described(machine: MachineFile) -> dict[str, Any]:
     """The parts of a machine file that must not change after commissioning, as plain JSON."""
-    return json.loads(json.dumps(machine.model_dump(mode="json", include=_DESCRIBED)))  # type: ignore[no-any-return]
+    return machine.model_dump(mode="json", include=_DESCRIBED)
 
 
 def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:

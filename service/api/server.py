@@ -144,7 +144,6 @@ class HttpConnections:
     """
 
     def __init__(self, settings: HttpSettings, most: int, proxies: Sequence[str], *, plain: bool = True) -> None:
-        self.exhausted = 0  # number of failures to accept because the process or the system had no file left
         self._most = most
         self._per_address = settings.connections_per_address
         self._longest_s = {
@@ -255,7 +254,6 @@ class HttpConnections:
         if not isinstance(error, OSError) or error.errno not in _OUT_OF_RESOURCES:
             loop.default_exception_handler(context)
             return
-        self.exhausted += 1
         text = "no connection can be accepted; logged at most once a minute"
         self._limiter.say("accept", _log.error, text, why=error.strerror)
 
@@ -338,11 +336,6 @@ class HttpServer:
         self.url = f"{'http' if access.tls is None else 'https'}://{host}:{self._socket.getsockname()[1]}"
         self._server: _Server | None = None
         self._thread: threading.Thread | None = None
-
-    @property
-    def exhausted(self) -> int:
-        """Number of failures to accept a connection because no file was left."""
-        return self._connections.exhausted
 
     def start(self, app: FastAPI) -> None:
         """Serve the API."""

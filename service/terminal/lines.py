@@ -22,7 +22,6 @@ def report_line(report: Report) -> str:
     Examples
     --------
     >>> from rotorwatch.records.example import example
-    >>> from rotorwatch.records.health import Report
     >>> report_line(Report.model_validate(example(Report)))
     '00:03:25  demo/lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
@@ -55,7 +54,6 @@ def report_row(report: Report) -> str:
     Examples
     --------
     >>> from rotorwatch.records.example import example
-    >>> from rotorwatch.records.health import Report
     >>> report_row(Report.model_validate(example(Report)))
     '00:03:25  −24.7±1.4                                                   k_by'
     """
@@ -87,7 +85,6 @@ def alarm_event_line(event: AlarmCloudEvent) -> str:
 
     Examples
     --------
-    >>> from rotorwatch.records.alarms import AlarmCloudEvent
     >>> from rotorwatch.records.example import example
     >>> alarm_event_line(AlarmCloudEvent.model_validate(example(AlarmCloudEvent)))
     '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by −24.7% ± 1.4%'
@@ -115,7 +112,6 @@ def health_line(health: Health) -> str:
     Examples
     --------
     >>> from rotorwatch.records.example import example
-    >>> from rotorwatch.records.health import Health
     >>> health_line(Health.model_validate(example(Health)))
     '00:03:25  demo/lab  state is alert'
     """

@@ -25,6 +25,7 @@ from simulator.stream import blocks
 
 _BLOCK_S = 5.0
 _REALISATION = 1
+_SPREAD = 0.3  # largest relative change of a parameter that varies, either way
 
 
 class Purpose(IntEnum):
@@ -50,8 +51,7 @@ class Draw:
     seed: int  # of the whole training or study
     purpose: Purpose
     stream: int = 0  # distinguishes series of windows of the same purpose (equations, cells of a table)
-    kept_nominal: tuple[str, ...] = PARAMETERS  # parameters that do not vary
-    spread: float = 0.3  # the others vary uniformly by up to this relative amount
+    kept_nominal: tuple[str, ...] = PARAMETERS  # parameters that do not vary; the others do, uniformly
     faults: dict[str, float] = field(default_factory=dict)  # fixed relative changes on top
     layout: Layout | None = None  # None draws one of them at random for each window
     # All windows share the condition drawn for number 0; only the realisation of force and noise differs. Number 0
@@ -91,7 +91,7 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     condition_number = 0 if draw.fixed_condition else number
     rng = generator(draw, condition_number)
     varied = [name for name in PARAMETERS if name not in draw.kept_nominal]
-    changes = {name: float(rng.uniform(-draw.spread, draw.spread)) for name in varied} | draw.faults
+    changes = {name: float(rng.uniform(-_SPREAD, _SPREAD)) for name in varied} | draw.faults
     tolerance = machine.operation.speed_tolerance
     speed_rpm = machine.operation.speed_rpm * float(rng.uniform(1 - tolerance, 1 + tolerance))
     cutoff_hz = float(rng.uniform(*condition.cutoff_hz))

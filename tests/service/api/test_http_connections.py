@@ -18,6 +18,7 @@ from service.api.server import HttpServer, http_connections
 from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import HttpSettings
+from service.terminal.logs import Limiter
 from tests.service.access.test_access_tokens import files, trusting
 from tests.service.rig.live import OPEN, endpoint, program, settings, until
 
@@ -206,7 +207,14 @@ def test_the_end_of_an_idle_connection_is_not_logged(tmp_path: Path) -> None:
         assert [one["why"] for one in logs if one["event"].startswith("connection ended")] != []
 
 
-def test_running_out_of_file_descriptors_is_logged_once() -> None:
+def test_running_out_of_file_descriptors_is_logged_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    admit, asked = Limiter.admit, list[str]()
+
+    def counted(limiter: Limiter, kind: str) -> int | None:
+        asked.append(kind)
+        return admit(limiter, kind)
+
+    monkeypatch.setattr(Limiter, "admit", counted)
     app = FastAPI()
     app.get("/healthz")(lambda: True)
     server = HttpServer(HttpSettings(port=0), AccessSettings())
@@ -224,7 +232,7 @@ def test_running_out_of_file_descriptors_is_logged_once() -> None:
         for one in late:
             one.connect((place.host, place.port))
             one.sendall(HEAD + b"\r\n")
-        until(lambda: server.exhausted >= 2, "attempts at accepting")
+        until(lambda: asked.count("accept") >= 2, "attempts at accepting")
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         for one in late:
             one.settimeout(180)
