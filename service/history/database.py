@@ -357,8 +357,7 @@ class Database:
             raise StoreError(f"{self.shown}: PostgreSQL needs psycopg: pip install 'rotorwatch[postgres]'") from error
 
         @event.listens_for(engine, "connect")
-        def limit(connection: Any, record: object) -> None:
-            _ = record
+        def limit(connection: Any, _record: object) -> None:
             encoding = connection.info.parameter_status("server_encoding")
             if encoding != "UTF8":  # a reason or a name that it cannot hold would stop all writing
                 raise StoreError(
@@ -372,8 +371,7 @@ class Database:
             connection.commit()
 
         @event.listens_for(engine, "checkout")
-        def still_there(connection: Any, record: object, proxy: object) -> None:
-            _ = record, proxy
+        def still_there(connection: Any, _record: object, _proxy: object) -> None:
             # Not a ping, which waits for a server that hangs: a connection that the server has closed can be read.
             line = select.poll()
             line.register(connection.fileno(), select.POLLIN)
@@ -426,8 +424,7 @@ def checked_url(url: str) -> URL:
     return made
 
 
-def _prepare_sqlite(connection: Any, record: object) -> None:
-    _ = record
+def _prepare_sqlite(connection: Any, _record: object) -> None:
     connection.isolation_level = None  # the transactions below, not those that the driver would begin
     # Small pages: each page that a step touches is written whole, and few hold more than one thing that it changes.
     # Pages that every step touches go from the log into the file only every few hundred steps.
