@@ -126,7 +126,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     usual_cutoff_hz = math.sqrt(math.prod(machine.condition.cutoff_hz))
     force_scale = usual_force(machine, motions, groups, speed, usual_cutoff_hz)
     model = SpectralModel(machine, motions, groups, force_scale)
-    observed = motions.spectra(groups.average(window.spectrum), model.centre)
+    observed = model.observed(groups.average(window.spectrum))
     search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _COLOUR_RIDGE)
     search.weights.ridge[: model.cutoff_at] = _FIXING_RIDGE
     try:

@@ -20,6 +20,7 @@ from models.diagnosis.likelihood.scoring import (
     Derivatives,
     Maximum,
     Weights,
+    gradient_of,
     information_of,
     inverse_factor,
     whitened_at,
@@ -68,7 +69,7 @@ class Linearised:
         """Linearise around the maximum of a search that has just ended, with its slopes."""
         point = found.whitened.point.expected
         # Where only the pulls on T determine the levels, the equation keeps the gradient that the search ended with.
-        left = _gradient(found.derivatives.slopes, packed(found.whitened.excess), weights)[model.level_at]
+        left = gradient_of(found.derivatives.slopes, packed(found.whitened.excess), weights)[model.level_at]
         return cls(model, weights, point, point, found.derivatives, left, found.fitted)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -129,7 +130,7 @@ class Linearised:
         before = np.inf
         for steps in range(_MOST_STEPS + 1):
             rest = self._whitened(observed - point.S)
-            gradient = self._pulled(_gradient(self.derivatives.slopes, rest, self.weights), point, 1.0)
+            gradient = self._pulled(gradient_of(self.derivatives.slopes, rest, self.weights), point, 1.0)
             step = np.asarray(covariance @ gradient, dtype=np.float64)
             left = float(gradient @ step) / 2
             if np.all(np.abs(step[diagnosed]) < near * errors) and left < gain:
@@ -158,7 +159,7 @@ class Linearised:
         """
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
-        gradient = _gradient(self.derivatives.slopes, rest, self.weights)
+        gradient = gradient_of(self.derivatives.slopes, rest, self.weights)
         covariance = self._inverse(share)
         step = covariance @ self._pulled(gradient, point, share)
         diagnosed = slice(model.cutoff_at)
@@ -192,9 +193,3 @@ class Linearised:
             information = share * self.derivatives.information + np.diag(self._pull)
             self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return self._inverses[share]
-
-
-def _gradient(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
-    """Gradient of the data's log-likelihood with respect to every parameter, levels as elements of C."""
-    weighted = (rest * weights.averages[:, None]).ravel()
-    return np.asarray(slopes.reshape(slopes.shape[0], -1) @ weighted, dtype=np.float64)

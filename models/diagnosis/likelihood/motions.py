@@ -221,11 +221,6 @@ class Motions:
                 matrix[..., at, self._v[at]] = share / self._unit_v[at]
         return matrix
 
-    def spectra(self, states: ComplexArray, w: FloatArray) -> ComplexArray:
-        """Cross-spectra of the motions from those of the states, shape (n_groups, n, n)."""
-        matrix = self.combine(w)
-        return np.asarray(matrix @ states @ matrix.conj().swapaxes(-1, -2), dtype=np.complex128)
-
     def shares(self, w: FloatArray) -> dict[str, tuple[int, FloatArray]]:
         """For each state, the motion it is part of and its share of that motion's amplitude at frequencies w."""
         r2 = self._r(w) ** 2

@@ -206,14 +206,13 @@ class FisherScoring:
         self, theta: FloatArray, whitened: Whitened, derivatives: Derivatives | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Speeds]:
         """Gradient and information with respect to T, packed slopes, information with respect to C, slopes' speed."""
-        model, averages, speed_rad_s = self._model, self.weights.averages, self._speed_rad_s
+        model, speed_rad_s = self._model, self._speed_rad_s
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
             on_levels = information_of(slopes, self.weights, self._weighted)
         else:
             slopes, on_levels, speed_rad_s = derivatives.slopes, derivatives.information.copy(), derivatives.speed_rad_s
-        excess = packed(whitened.excess) * averages[:, None]
-        gradient: FloatArray = slopes.reshape(model.size, -1) @ excess.ravel()
+        gradient = gradient_of(slopes, packed(whitened.excess), self.weights)
         levels = model.level_at
         chain = _levels_by_factor(model.factor(theta))
         information = on_levels.copy()
@@ -225,6 +224,12 @@ class FisherScoring:
         information[np.diag_indices(model.size)] += self.weights.ridge
         on_levels[np.diag_indices(model.size)] += self.weights.pull
         return gradient, information, slopes, on_levels, speed_rad_s
+
+
+def gradient_of(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
+    """Gradient of the data's log-likelihood with respect to every parameter, levels as elements of C."""
+    weighted = (rest * weights.averages[:, None]).ravel()
+    return np.asarray(slopes.reshape(slopes.shape[0], -1) @ weighted, dtype=np.float64)
 
 
 def information_of(slopes: FloatArray, weights: Weights, out: FloatArray | None = None) -> FloatArray:

@@ -116,7 +116,7 @@ def test_the_score_is_the_slope_of_the_likelihood() -> None:
     groups = groups_of(LAB, 4.0)
     power = np.einsum("fii->i", window.spectrum).real / window.spectrum.shape[0]
     model = SpectralModel(LAB, Motions(window.states, np.sqrt(power)), groups, 1.0)
-    observed = model.motions.spectra(groups.average(window.spectrum), model.centre)
+    observed = model.observed(groups.average(window.spectrum))
     search = FisherScoring(model, observed, window.n_segments, window.speed_rad_s, 80.0)
     rng = np.random.default_rng(1)
     theta = search.weights.centre + rng.normal(0, 0.1, model.size)
@@ -368,10 +368,15 @@ def spectra(motion: FloatArray, noise: FloatArray, gains: tuple[float, float, fl
     return np.asarray(seen @ (motion * np.eye(2)) @ seen.conj().swapaxes(1, 2) + np.diag(noise * SCALE**2))
 
 
+def of_motions(motions: Motions, states: ComplexArray) -> ComplexArray:
+    matrix = motions.combine(W)
+    return np.asarray(matrix @ states @ matrix.conj().swapaxes(1, 2))
+
+
 def test_equal_sensor_noise_stays_white_with_unit_variance() -> None:
     motions = Motions(STATES, SCALE)
     assert motions.n == 2
-    seen = motions.spectra(spectra(np.array(0.0), np.ones(3)), W)
+    seen = of_motions(motions, spectra(np.array(0.0), np.ones(3)))
     np.testing.assert_allclose(seen, np.broadcast_to(np.eye(2), seen.shape), atol=1e-12)
 
 
@@ -379,7 +384,7 @@ def test_a_motion_combines_the_information_of_both_its_sensors() -> None:
     """Its signal-to-noise ratio is the sum of the sensors' own: nothing is lost, nothing counted twice."""
     motions = Motions(STATES, SCALE)
     power = 1e-12
-    seen = motions.spectra(spectra(np.array(power), np.zeros(3)), W)
+    seen = of_motions(motions, spectra(np.array(power), np.zeros(3)))
     np.testing.assert_allclose(seen[:, 0, 0].real, power / SCALE[0] ** 2 + power * W**2 / SCALE[2] ** 2)
     np.testing.assert_allclose(seen[:, 1, 1].real, power / SCALE[1] ** 2)
     np.testing.assert_allclose(np.abs(motions.factor(W, W)[:, 0]) ** 2 * power, seen[:, 0, 0].real)
