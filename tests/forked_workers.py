@@ -21,7 +21,7 @@ CONTEXT.set_forkserver_preload(
         *("models.commissioning.commission", "service.analysis.figures.spectrum", "simulator.commission.page"),
         *("service.interchange.importing", "scipy.io", "scipy.optimize", "scipy.stats", "pyarrow.parquet"),
         *("h5py", "nptdms", "playwright.sync_api", "psycopg", "pytest", "pyuff", "trustme", "yaml"),
-        *("hypothesis.extra.numpy", "schemathesis.specs.openapi.checks"),
+        *("hypothesis.extra.numpy", "schemathesis.specs.openapi.checks", "pandas", "benchmarks.studies.__main__"),
     ]
 )
 

@@ -11,10 +11,20 @@ from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS, system_A
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
+from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, PARTIAL, blind, commissioned, healthy, recording, without_angle
+from tests.commissioning.rotor_kit import (
+    LAB,
+    PARTIAL,
+    blind,
+    commissioned,
+    healthy,
+    recording,
+    windows_of,
+    without_angle,
+)
 from tests.service.rig.watching import feed, resumed
 
 SEED = 4_900_001
@@ -67,15 +77,16 @@ def test_commissioning_finds_the_sense(machine: MachineFile) -> None:
     """With a shaft angle, or without one, where the size of the unbalance is identified."""
     seen = stream(75.0, SEED + 2)
     seen = seen if "theta" in machine.descriptor.states else tuple(without_angle(seen))
-    made = commissioned(machine, recording(machine, seen))
+    recorded = recording(machine, seen)
+    made = commissioned(machine, recorded)
     assert made.commissioned is not None, made.report.summary
     assert made.commissioned.gyroscopic == "opposite"
     assert "rise with the speed" in made.report.notes[-1]
     known = Installed(machine, None, made.commissioned).known
     assert known is not None
     assert known.rotor.I2p_kg_m2 == -LAB.rotor.I2p_kg_m2
-    windows, _ = feed(MachineMonitor(Installed(machine, None, made.commissioned)), seen)
-    assert windows[-1].gyroscopic == "opposite"
+    (window,) = windows_of(recorded)
+    assert evaluator_for(Installed(machine, None, made.commissioned)).evaluate(window).gyroscopic == "opposite"
 
 
 def test_commissioning_keeps_the_sense_of_eq_27_if_it_explains_the_recordings() -> None:
