@@ -21,6 +21,7 @@ from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, u
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import (
+    CORNERS,
     STRUCTURAL,
     Expected,
     SpectralModel,
@@ -55,6 +56,7 @@ _LINE_ERROR = 0.01  # least relative error of e if the angle is that of a line f
 # and sensor noise of 0.3 %, the mean speed alone fits at 0.16 % and misfits by 7 standard errors at 0.32 %.
 _WANDERS = 0.002
 _MISFITS = 4  # windows in a row that misfit before one is searched cold as well, and the better maximum kept
+_DOUBTFUL = 2.0  # misfit after a cold search from which another is made, with a noise of more corners
 _FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
 _Band = tuple[FloatArray, npt.NDArray[np.bool_]]
@@ -80,6 +82,7 @@ class LikelihoodFit:
         self._strength: float | None = None
         self._line: Linearised | None = None
         self._line_segments = self._followed = self._misfits = 0
+        self._corners = 1  # of the sensor noise's colour
         self._line_band: _Band | None = None
         self._latest: tuple[SpectralModel, Expected, FloatArray, float] | None = None
         self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
@@ -90,16 +93,18 @@ class LikelihoodFit:
         self._last = self._strength = self._line = None
         self._misfits = 0
 
-    def start_near(self, other: "LikelihoodFit") -> None:
-        """Start the next window where another fit of the same machine has ended."""
-        self._last, self._strength, self._line = other._last, other._strength, None
+    def start_near(self, other: "LikelihoodFit", *, anew: bool) -> None:
+        """Start the next window where another fit of the same machine has ended: `anew`, or if the noise is another."""
+        if anew or self._corners != other._corners:
+            self._last, self._strength, self._line = other._last, other._strength, None
+            self._corners = other._corners
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""
         found: dict[str, np.ndarray] = {
             "last": np.array([] if self._last is None else self._last, dtype=np.float64),
             "strength": np.array([] if self._strength is None else [self._strength], dtype=np.float64),
-            "followed": np.array([self._line_segments, self._followed, self._misfits], dtype=np.int64),
+            "followed": np.array([self._line_segments, self._followed, self._misfits, self._corners], dtype=np.int64),
         }
         line = self._line
         if line is not None and self._line_band is not None:
@@ -118,22 +123,22 @@ class LikelihoodFit:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue where `checkpoint` was called, with the same bits; what raises has changed nothing."""
         last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
-        segments, followed, misfits = checked(arrays, "followed", np.int64, (3,)).tolist()
+        segments, followed, misfits, corners = checked(arrays, "followed", np.int64, (4,)).tolist()
         line = band = None
         if "states" in arrays:
             frequencies_hz = checked(arrays, "frequencies_hz", np.float64, (None,))
             band = frequencies_hz, checked(arrays, "excluded", np.bool_, frequencies_hz.shape)
             try:
                 with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                    line = self._restored_line(arrays, segments, band)
+                    line = self._restored_line(arrays, segments, band, corners)
             except np.linalg.LinAlgError as error:
                 raise CheckpointError(f"{self._machine.name}: the remembered maximum makes no valid spectra") from error
         self._last = last if last.size else None
         self._strength = float(strength[0]) if strength.size else None
         self._line, self._line_band, self._line_segments = line, band, segments
-        self._followed, self._misfits = followed, misfits
+        self._followed, self._misfits, self._corners = followed, misfits, corners
 
-    def _restored_line(self, arrays: Mapping[str, np.ndarray], segments: int, band: _Band) -> Linearised:
+    def _restored_line(self, arrays: Mapping[str, np.ndarray], segments: int, band: _Band, corners: int) -> Linearised:
         states, (frequencies_hz, excluded) = texts(arrays, "states"), band
         if not STATE_INDEX.keys() >= set(states) or frequencies_hz.size < 2 or excluded.all():
             raise CheckpointError(
@@ -144,7 +149,8 @@ class LikelihoodFit:
         force_scale = float(checked(arrays, "force_scale", np.float64, ()))
         line = unprefixed("line", arrays)
         speeds = 2 if checked(line, "speeds_rad_s", np.float64, (None,)).size > 3 else 1
-        model = SpectralModel(self._machine, motions, self._grouped(band, speeds), force_scale)
+        groups = self._grouped(band, speeds)
+        model = SpectralModel(self._machine, motions, groups, force_scale, corners=corners)
         strength = float(checked(arrays, "line_strength", np.float64, ()))
         return Linearised.restored(model, Weights(model, segments, self._usual_cutoff_hz, strength), line)
 
@@ -158,16 +164,27 @@ class LikelihoodFit:
         UnexplainedError
             If the search finds no maximum, or nothing within the model comes near the window.
         """
-        window = integrated(window)
+        window, afresh, first = integrated(window), self._last is None, self._latest is None
         found = self._searched(window)
-        if self._misfits and self._misfits % _MISFITS == 0:  # perhaps all of them have ended at a wrong maximum
-            cold = copy(self)
-            cold.reset()
-            with suppress(EstimationError):
-                other = cold._searched(window)
-                if not other.unexplained and (other.misfit_z or 0.0) < (found.misfit_z or 0.0):
-                    vars(self).update(vars(cold))
-                    return other
+        again = self._misfits > 0 and self._misfits % _MISFITS == 0
+        if again and not afresh:  # perhaps all of them have ended at a wrong maximum
+            found = self._retried(window, found, self._corners, found.misfit_z or 0.0)
+        misfit_z = found.misfit_z or 0.0
+        if self._corners < CORNERS and (again or afresh) and misfit_z > _DOUBTFUL and (first or not found.unexplained):
+            # Perhaps the noise has a colour of more than one corner.
+            found = self._retried(window, found, CORNERS, min(misfit_z, MOST_MISFIT))
+        return found
+
+    def _retried(self, window: WindowStatistics, found: Diagnosis, corners: int, most_misfit: float) -> Diagnosis:
+        """Return and keep what a cold search finds if it misfits by less than `most_misfit`, otherwise `found`."""
+        cold = copy(self)
+        cold.reset()
+        cold._corners = corners
+        with suppress(EstimationError):
+            other = cold._searched(window)
+            if not other.unexplained and (other.misfit_z or 0.0) < most_misfit:
+                vars(self).update(vars(cold))
+                return other
         return found
 
     def _searched(self, window: WindowStatistics) -> Diagnosis:
@@ -380,7 +397,7 @@ class LikelihoodFit:
         groups = self._grouped(band, _count(speed))
         motions = Motions(window.states, scale)
         force_scale = usual_force(self._machine, motions, groups, speed, self._usual_cutoff_hz)
-        model = SpectralModel(self._machine, motions, groups, force_scale)
+        model = SpectralModel(self._machine, motions, groups, force_scale, corners=self._corners)
         search = self._search(model, window, speed, self._strength)
         if self._last is not None and self._last.size == model.size:
             try:
@@ -389,7 +406,7 @@ class LikelihoodFit:
                 self.reset()
                 search = self._search(model, window, speed)
         wide = self._grouped(band, _count(speed), _COARSE)
-        coarse = SpectralModel(self._machine, motions, wide, force_scale, shapes=0)
+        coarse = SpectralModel(self._machine, motions, wide, force_scale, shapes=0, corners=self._corners)
         first = self._search(coarse, window, speed)
         start = starting_point(coarse, _observed(coarse, window), first.weights.centre, self._speed(window))
         near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta

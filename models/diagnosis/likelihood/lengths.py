@@ -86,7 +86,6 @@ class LengthFits:
         if seen is not None:
             return seen
         fit = self._short.setdefault(hops, LikelihoodFit(self._machine, sized=self._sized))
-        if self._searched.get(hops) != self._hop - 1:
-            fit.start_near(self._window)
+        fit.start_near(self._window, anew=self._searched.get(hops) != self._hop - 1)
         self._searched[hops] = self._hop
         return fit.diagnose(stretch)

@@ -17,7 +17,8 @@ from the information on C itself, which stays right where T loses rank (decision
 
 The sensor noise has a smooth spectrum of its own in every motion, d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of
 the band's end: white for b = 0, first-order low-pass at f_r for b = -1; d₀ combines the densities of the sensors.
-Assuming white noise where it is not white lowered the damping read on the heavy machine by up to 15 %.
+Assuming white noise where it is not white lowered the damping read on the heavy machine by up to 15 %. With several
+corners, a product of such powers follows noise that falls from the band's lower end, such as that of an integrator.
 """
 
 from copy import copy
@@ -43,6 +44,9 @@ Speeds = float | tuple[float, float]
 The spectra are averaged over both. With a single source, motions at one speed are fully coherent but for noise, and
 those at a mixture of speeds are not, which would pass for a misfit.
 """
+CORNERS = 3  # of the noise's colour, where one does not suffice
+_APART = 4.0  # ratio of each corner to the next
+_GRID = 100  # frequencies over which their functions are made orthonormal
 SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
 ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
 IDENTITY = np.eye(6)[ROWS, COLUMNS]  # equal independent sources of level one
@@ -93,10 +97,16 @@ class SpectralModel:
     """
 
     def __init__(
-        self, machine: Machine, motions: Motions, groups: BinGroups, force_scale: float = 1.0, shapes: int = SHAPES
+        self,
+        machine: Machine,
+        motions: Motions,
+        groups: BinGroups,
+        force_scale: float = 1.0,
+        shapes: int = SHAPES,
+        corners: int = 1,
     ) -> None:
         rotor = machine.rotor
-        self.machine, self.motions, self.n, self.shapes = machine, motions, motions.n, shapes
+        self.machine, self.motions, self.n, self.shapes, self.corners = machine, motions, motions.n, shapes, corners
         # A moment acts through a lever of a third of the shaft, so that levels of forces and moments share one unit.
         lever = rotor.shaft_length_m / 3
         self.force_unit = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
@@ -105,7 +115,7 @@ class SpectralModel:
         self.cutoff_at = len(STRUCTURAL)
         self.order_at = self.cutoff_at + 1
         self.noise_at = slice(self.order_at + 1, self.order_at + 1 + len(motions.states))
-        self.colour_at = slice(self.noise_at.stop, self.noise_at.stop + self.n)
+        self.colour_at = slice(self.noise_at.stop, self.noise_at.stop + corners * self.n)
         self.shape_at = slice(self.colour_at.stop, self.colour_at.stop + 6 * shapes)
         self.level_at = slice(self.shape_at.stop, self.shape_at.stop + ROWS.size)
         self.size = self.level_at.stop
@@ -120,7 +130,7 @@ class SpectralModel:
     def _see(self, groups: BinGroups) -> None:
         self.groups = groups
         low, high = self.machine.window.band_hz
-        self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
+        self._noise_shapes = _noise_shapes(groups.centre_hz, low, high, self.corners)
         # In √f the polynomials resolve a low-pass at the lower end as well as a hump at the upper end.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
         self._b = eval_legendre(np.arange(1, self.shapes + 1), x[:, None])
@@ -246,7 +256,8 @@ class SpectralModel:
 
     def _noise_parts(self, theta: FloatArray) -> FloatArray:
         """Contribution of each state to the noise density of its motion, shape (n_groups, n_states)."""
-        exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at][self._motion_of]
+        colour = self._noise_shapes @ theta[self.colour_at].reshape(self.corners, self.n)
+        exponent = theta[self.noise_at] + colour[:, self._motion_of]
         return np.asarray(self._share * np.exp(exponent), dtype=np.float64)
 
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
@@ -271,7 +282,9 @@ class SpectralModel:
         of_noise = L_inverse.transpose(2, 0, 1)
         densities = packed(of_noise[:, :, :, None] * of_noise.conj()[:, :, None, :])
         out[self.noise_at] = self._noise_parts(theta).T[:, :, None] * densities[self._motion_of]
-        out[self.colour_at] = (self.noise(theta) * self._noise_shape[:, None]).T[:, :, None] * densities
+        of_colours = out[self.colour_at].reshape(self.corners, self.n, *out.shape[1:])
+        shaped = self.noise(theta)[:, None] * self._noise_shapes[..., None]
+        np.multiply(shaped.transpose(1, 2, 0)[..., None], densities, out=of_colours)
         left, right = (side.transpose(3, 0, 2, 1) for side in (whitened, response.conj()))  # of every force
         by_force = twice_packed(np.asarray(left @ right.swapaxes(2, 3))) / 2
         of_shapes = out[self.shape_at].reshape(self.shapes, 6, *out.shape[1:])
@@ -280,6 +293,21 @@ class SpectralModel:
         pairs = (columns @ columns.conj().swapaxes(1, 2)).reshape(-1, self.n, 6, self.n, 6)[:, :, ROWS, :, COLUMNS]
         out[self.level_at] = twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
         return out
+
+
+def _noise_shapes(frequencies_hz: FloatArray, low_hz: float, high_hz: float, corners: int) -> FloatArray:
+    """Functions of frequency that colour the noise, shape (n_frequencies, corners).
+
+    Several are orthonormal over the band and to a constant: where parameters do nearly the same, the search is slow.
+    """
+    corner_hz = 2 / 3 * high_hz
+    if corners == 1:
+        return np.log1p((frequencies_hz[:, None] / corner_hz) ** 2)
+    at_hz = np.concatenate([np.linspace(low_hz, high_hz, _GRID), frequencies_hz])[:, None]
+    shapes = np.log1p((_APART ** np.arange(corners) * at_hz / corner_hz) ** 2)
+    shapes = np.column_stack([np.ones(len(at_hz)), shapes])
+    L = np.linalg.cholesky(shapes[:_GRID].T @ shapes[:_GRID] / _GRID)
+    return np.asarray(np.linalg.solve(L, shapes[_GRID:].T)[1:].T, dtype=np.float64)
 
 
 class Sides:

@@ -56,7 +56,7 @@ def test_following_and_glancing_agree_with_a_full_search(layout: Layout) -> None
         seen = sure(following.glance(stretch))
         assert seen.misfit_z is None
         near = LikelihoodFit(LAB)
-        near.start_near(following)
+        near.start_near(following, anew=True)
         (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
         assert np.all(np.abs(glanced - searched) < 0.8 * error)
         np.testing.assert_allclose(glanced_error, error, rtol=0.15)

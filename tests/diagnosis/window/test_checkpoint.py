@@ -15,6 +15,7 @@ from models.commissioning.commissioned import install
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.likelihood.spectral_model import CORNERS
 from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window.moments import plan_for
@@ -131,13 +132,13 @@ def windows(spread: float = 0.0) -> tuple[WindowStatistics, ...]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spread", [0.0, 0.01])
-def test_a_maximum_followed_over_many_windows_continues_bit_for_bit(spread: float) -> None:
+@pytest.mark.parametrize(("spread", "corners"), [(0.0, 1), (0.01, 1), (0.0, CORNERS)])
+def test_a_maximum_followed_over_many_windows_continues_bit_for_bit(spread: float, corners: int) -> None:
     """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
-    fit = LikelihoodFit(LAB, follow=True)
+    fit, running = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB, follow=True)
+    fit._corners = running._corners = corners
     expected = [fit.diagnose(window) for window in windows(spread)]
     assert len(expected) == 16
-    running = LikelihoodFit(LAB, follow=True)
     for window, diagnosis in zip(windows(spread), expected, strict=True):
         again = LikelihoodFit(LAB, follow=True)
         again.restore(from_bytes(to_bytes(running.checkpoint())))
