@@ -292,6 +292,7 @@ class WindowLevels:
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
+    settled: npt.NDArray[np.bool_] | None = None  # (n_hops,), whether the shaft is known to have turned at one speed
 
     def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
         """Copy these levels with NaN for some channels, and for levels of the pairs of displacements they are in.

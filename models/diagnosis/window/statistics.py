@@ -388,13 +388,14 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
     speeds, (slowest, fastest) = rotation.hop_speed_rad_s, _speeds(rotation, hops, plan)[1]
     if rotation.source == "estimated" and not (rotation.settled.all() and fastest < (1 + _VARIED) * slowest):
         speeds = np.full(len(hops), np.nan)  # while the speed changes, orders are not at multiples of the speed found
-    return window_levels(
+    found = window_levels(
         plan.levels,
         [hop.levels for hop in hops if hop.levels is not None],
         speeds,
         phase_reference=rotation.source == "phase reference",
         errors=errors,
     )
+    return replace(found, settled=rotation.settled)
 
 
 def _coherence(shared: ComplexArray | FloatArray, powers: FloatArray) -> FloatArray:
