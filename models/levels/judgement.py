@@ -107,13 +107,19 @@ class LevelJudge:
     ) -> tuple[ChannelLevels, ...]:
         """Judge the levels of one window, channel by channel; columns with `missing` samples have none.
 
-        If lines `moved` to other bands within the window, there is no growth.
+        If lines `moved` to other bands within the window, there is no growth. Then, and at a speed that the reference
+        does not know, random vibration at 2x may be many times that of the reference: its limit counts only for a 2x
+        that stands out of the present one.
         """
         relative = None if reference is None else self._relative_limits(levels, reference)
         grown: Sequence[Growth | None] = [None] * len(self._channels)
         if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
             grown = growth(levels.bands, relative.bands)
         grown = [None if column in missing else one for column, one in enumerate(grown)]
+        told = np.full(len(grown), True)  # which 2x are compared
+        if reference is not None and (moved or not reference.at(levels.speed_rad_s)[1]):
+            hidden = levels.hidden_twice
+            told = ~told if hidden is None else ~hidden
         values = np.full((len(_SHOWN), len(grown)), np.nan)
         values[: len(_MEASURED)] = [levels.values[name] for name in _MEASURED]
         values[: len(_MEASURED)] /= self._units
@@ -125,8 +131,8 @@ class LevelJudge:
         values[:, [*missing]] = np.nan
         shown = all_rounded(values.T)
         return tuple(
-            self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, relative, grown[column])
-            for column, own in enumerate(values.T.tolist())
+            self._channel(column, own, dict(zip(_SHOWN, shown[column], strict=True)), levels, relative, one, x2)
+            for column, (own, one, x2) in enumerate(zip(values.T.tolist(), grown, told.tolist(), strict=True))
         )
 
     def foreign(
@@ -262,6 +268,7 @@ class LevelJudge:
         levels: WindowLevels,
         relative: RelativeLimits | None,
         grown: Growth | None,
+        told: bool,
     ) -> ChannelLevels:
         channel = self._channels[column]
         standard = self._standard(channel, levels.speed_rad_s)
@@ -277,12 +284,13 @@ class LevelJudge:
                     f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: outside its acceptance region around "
                     f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
                 )
-        key, words = (column, id(relative), standard, zone, edge), MEASURE_WORDS  # unique while the reference is kept
+        words = MEASURE_WORDS
+        key = column, id(relative), standard, zone, edge, told  # unique while the reference is kept
         limits = self._limits.get(key)
         if limits is None:
             if len(self._limits) >= _MOST_KEPT * len(self._channels):
                 self._limits.clear()
-            limits = self._limits[key] = self._limits_of(column, relative, standard, zone, edge)
+            limits = self._limits[key] = self._limits_of(column, relative, standard, zone, edge, told)
         if grown is not None and relative is not None:
             limits = limits | {"growth": self._growth(relative.source, grown.limit)}
             words = {**MEASURE_WORDS, "growth": band_in_words(grown.band_hz)}
@@ -296,9 +304,18 @@ class LevelJudge:
         return self._blank[column].model_copy(update=record)
 
     def _limits_of(
-        self, column: int, relative: RelativeLimits | None, standard: _Standard | None, zone: str, edge: float | None
+        self,
+        column: int,
+        relative: RelativeLimits | None,
+        standard: _Standard | None,
+        zone: str,
+        edge: float | None,
+        told: bool,
     ) -> dict[str, _Nearest]:
-        """Limits of a channel except for its bands; `edge` is that for a 1x vector out of its acceptance region."""
+        """Limits of a channel except for its bands.
+
+        `edge` is that for a 1x vector out of its acceptance region; `told`, whether 2x is compared with the reference.
+        """
         limits = defaultdict[str, list[Limit]](list)
         for own in self._settings.limits:
             if own.channel == self._channels[column].name:
@@ -307,7 +324,8 @@ class LevelJudge:
             name, measure, boundaries = standard
             limits[measure].append(Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries))
         for measure, limit in relative.limits[column].items() if relative is not None else ():
-            limits[measure].append(limit)
+            if told or measure != "x2":
+                limits[measure].append(limit)
         if edge is not None:
             limits["x1"].append(Limit(_X1_VECTOR, False, alert=edge))
         return {name: _nearest_limits(name, found) for name, found in limits.items()}

@@ -38,7 +38,7 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.levels.bands import ERRORS, NYQUIST_PART, BandLevels, band_edges
+from models.levels.bands import ERRORS, NEIGHBOURHOOD, NYQUIST_PART, BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
 from models.levels.orders import ORDERS, ComplexArray, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import FloatArray
@@ -292,6 +292,7 @@ class WindowLevels:
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
+    settled: npt.NDArray[np.bool_] | None = None  # (n_hops,), whether the shaft is known to have turned at one speed
 
     def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
         """Copy these levels with NaN for some channels, and for levels of the pairs of displacements they are in.
@@ -341,11 +342,15 @@ class WindowLevels:
         """
         if self.moments is None or self.speed_rad_s is None or self.bands is None or self.hops < _LEAST_HOPS:
             return None
-        if self.vectors is not None:
-            steps = np.abs(np.diff(self.moments[2][:, 1], axis=0)) ** 2  # where a line begins, it makes one of them
-            error = np.sqrt(np.median(steps, axis=0) / (2 * math.log(2) * self.hops))
-            return np.asarray(np.abs(self.vectors[2]) < ERRORS * error)
         known = self.moments[2][~np.isnan(self.moments[2][:, 1]).any(axis=1), 1]
+        if self.vectors is not None:
+            if len(known) < _LEAST_HOPS:
+                return np.full(known.shape[1], True)
+            steps = np.abs(np.diff(known, axis=0)) ** 2
+            # Where a line begins, it makes one of the steps. Where the speed changes, 2x passes resonances, in which
+            # the noise of a few hops exceeds that of all others.
+            power = _mean(steps) if self.unsteady > NEIGHBOURHOOD else np.median(steps, axis=0) / math.log(2)
+            return np.asarray(np.abs(self.vectors[2]) < ERRORS * np.sqrt(power / (2 * len(known))))
         at = int(np.searchsorted(self.bands.edges_hz, abs(self.speed_rad_s) / np.pi)) - 1
         if not 0 <= at < len(self.bands.rms) or not len(known):
             return None

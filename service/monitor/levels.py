@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from models.alarm_names import LEVEL
 from models.checkpoint import checked
@@ -22,7 +23,7 @@ from models.levels.contact import LatestContact
 from models.levels.judgement import Foreign, LevelJudge, channel_state, fallen
 from models.levels.measures import STANDS_RAD_S, WindowLevels
 from models.levels.orders import ORDERS
-from models.levels.reference import FirstWindows, LevelReference, expected_levels
+from models.levels.reference import QUIET, FirstWindows, LevelReference, expected_levels
 from models.machine import Machine, MachineFile
 from models.signals.channels import state_name, with_channel_names
 from rotorwatch.records.alarms import Evidence
@@ -116,11 +117,13 @@ class LevelWatch:
         if speeds is not None:
             turns = abs(speeds[-1]) > STANDS_RAD_S
             apart = np.abs(speeds / speeds[-1] - 1) > NEIGHBOURHOOD if turns else np.full(speeds.shape, False)
-            if self._several_speeds:  # an unknown speed, as in a run-up without a shaft angle, may be any of them
-                apart |= np.isnan(speeds)
+            unknown = np.isnan(speeds)
+            # An unknown speed, as in a run-up without a shaft angle, may be any of several.
+            apart |= unknown & (self._several_speeds or _starts_or_stops(found))
             if apart.any():  # the next hop may have begun at the other speed
                 self._moved_ns = hops[min(int(np.flatnonzero(apart)[-1]) + 1, len(hops) - 1)].end_ns
-            elif self._moved_ns <= hops[-1].end_ns:  # hops of unknown speed were at this one, except the oldest
+            elif self._moved_ns <= hops[-1].end_ns and not unknown.all():
+                # Hops of unknown speed were at this one, except the oldest.
                 self._moved_ns = min(self._moved_ns, hops[0].end_ns)
         if self.reference is not None and self.reference.at(found.speed_rad_s)[0].varied:
             return False
@@ -251,3 +254,16 @@ class LevelWatch:
         usual = turning or not self._several_speeds  # else the reference may be that of another speed
         kept = (one for one in levels.limits if one.measure not in gone and (usual or one.absolute))
         return levels.model_copy(update=dict.fromkeys(gone) | {"limits": tuple(kept)}) if gone else levels
+
+
+def _starts_or_stops(levels: WindowLevels) -> npt.NDArray[np.bool_]:
+    """Hops in which a machine without a shaft angle seems to start or stop, if their speed is unknown; shape (n_hops,).
+
+    Either no hop before, or none after, has the speed of the others; between hops of one speed only the line is lost.
+    Or every channel vibrates much less than in the newest hop, as before a run-up.
+    """
+    if levels.settled is None or levels.moments is None:
+        return np.array(False)
+    lost, square = ~levels.settled, levels.moments[0]
+    ends = np.logical_and.accumulate(lost) | np.logical_and.accumulate(lost[::-1])[::-1]
+    return np.asarray(ends | ~(square > QUIET**2 * square[-1]).any(axis=1))

@@ -8,7 +8,8 @@ of the speed follows the shaft; that of noise does neither.
 The level of the random forces may change within a window, too. The cross-spectra are treated as a mean over segments of
 equal level. If the level steps or drifts, few segments dominate that mean; it scatters like a mean over fewer segments,
 which looks like a misfit. Scaled to one level, segments of one rotor are alike; those with another rotor, a rub or a
-line are not, and remain a misfit.
+line are not, and remain a misfit. Sensor noise does not follow the load: motions that are mostly noise do not count for
+the level, and only segments of similar level are evaluated, as scaling also scales their noise.
 """
 
 from collections.abc import Sequence
@@ -246,6 +247,8 @@ def _mean_length(unit: ComplexArray) -> float:
 
 _BLOCK = 16  # bins that are compared at once: many more than channels, and few enough to share one colour
 _STEADY = 30.0  # variance of the levels, times the coefficients in each, below which a window is stationary; 3 is usual
+_CLEAR, _CLEAR_BLOCKS = 4.0, 5  # power over that of noise, and the fewest blocks: a line is in two of them at most
+_ALIKE = 2.0  # range of the levels evaluated together: sensor noise is scaled with the segments, and then varies itself
 _ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all segments are compared with
 
 
@@ -271,12 +274,35 @@ def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequ
         return None
     levels = np.ones(count)
     for _ in range(_ROUNDS):
-        motions = own.reshape(blocks, -1, n) @ np.linalg.eigh(mean)[1].conj()
+        values, axes = np.linalg.eigh(mean)
+        motions = own.reshape(blocks, -1, n) @ axes.conj()
         powers = (motions.real**2 + motions.imag**2).reshape(own.shape).sum(axis=1)  # (blocks, n_segments, n)
         usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
-        levels = np.median(powers / usual, axis=(0, 2))
+        clear = _clear(values, np.abs(axes) ** 2)
+        levels = np.median((powers / usual).swapaxes(1, 2)[clear], axis=0)
         levels /= max(float(levels.mean()), np.finfo(float).tiny)
-        if np.mean((levels - 1) ** 2) * own[:, :, 0].size < _STEADY or not np.all(levels > 0):
+        if np.mean((levels - 1) ** 2) * clear.sum() * _BLOCK < _STEADY or not np.all(levels > 0):
             return None
         mean = summed((own / np.sqrt(levels)[:, np.newaxis]).reshape(blocks, -1, n))
     return levels
+
+
+def _clear(values: FloatArray, shares: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which motions stand out of the sensors' noise, whose level does not follow the load, shape (n_blocks, n).
+
+    `values` are the powers of the motions, and `shares`, (n_blocks, n, n), those of each channel in them. A channel's
+    noise is at most what the other channels do not share, where that is least. All, if motions stand out in few blocks.
+    """
+    powers = np.maximum(values, np.finfo(float).tiny)
+    noise = (1 / (shares / powers[:, np.newaxis]).sum(axis=2)).min(axis=0)
+    clear = powers > _CLEAR * (noise @ shares)
+    return clear if np.count_nonzero(clear.any(axis=1)) >= _CLEAR_BLOCKS else np.ones_like(clear)
+
+
+def of_one_level(segments: ComplexArray, levels: FloatArray) -> ComplexArray:
+    """The most segments whose levels are within a factor of two, scaled to one; all, if those are less than a third."""
+    order = np.argsort(levels, kind="stable")
+    ends = np.searchsorted(levels[order], _ALIKE * levels[order], side="right")
+    first = int(np.argmax(ends - np.arange(levels.size)))
+    alike = np.sort(order[first : ends[first]]) if 3 * (ends[first] - first) >= levels.size else np.arange(levels.size)
+    return np.asarray(segments[:, alike] / np.sqrt(levels[alike])[:, np.newaxis], dtype=np.complex128)

@@ -160,7 +160,7 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     found = np.isfinite(followed)
     usual = float(np.median(strength[found])) if found.any() else 0.0
-    if usual <= STRONG:
+    if usual <= STRONG or found.size < 2:
         return np.full(found.shape, True)
     steps = np.diff(followed)
     near = _largest_step(followed, hop_s)[1:]

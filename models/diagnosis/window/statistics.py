@@ -8,7 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.window.equaliser import Equaliser
-from models.diagnosis.window.excluded import LOBE, ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
+from models.diagnosis.window.excluded import (
+    LOBE,
+    ExcludedLine,
+    KnownLine,
+    excluded_lines,
+    of_one_level,
+    segment_levels,
+    summed,
+)
 from models.diagnosis.window.moments import (
     ComplexArray,
     HopMoments,
@@ -45,7 +53,7 @@ class WindowStatistics:
     end_ns: int
     # How much data it holds.
     n_samples: int
-    n_segments: int
+    n_segments: int  # those its spectra are means of, see `of_one_level`
     lags_s: FloatArray  # (n_lags,), lags of the correlation functions, s
     # (n_lags, n, n): ``correlation[l, i, j]`` estimates R_ij(τ_l) = E{x_i(t) x_j(t+τ_l)} of the part that is neither
     # mean nor rotation-synchronous (Eq. 18), SI units.
@@ -262,19 +270,19 @@ def window_statistics(
         phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle[:, :, np.newaxis].conj())[:, :, 0], powers)
     alive = ~np.isin(plan.mounted, lost)
     levels = segment_levels(by_bin, spectrum, plan.motions(alive))
-    if levels is not None:
-        spectrum = summed(by_bin / np.sqrt(levels)[:, np.newaxis])
+    evaluated = by_bin if levels is None else of_one_level(by_bin, levels)
+    spectrum = spectrum if levels is None else summed(evaluated)
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,
         start_ns=hops[0].start_ns,
         end_ns=hops[-1].end_ns,
         n_samples=len(hops) * plan.hop,
-        n_segments=by_bin.shape[1],
+        n_segments=evaluated.shape[1],
         lags_s=plan.lags_s[:n_lags],
         correlation=correlation,
         hop_correlation=hop_correlation,
-        spectrum=divided(spectrum, by_bin.shape[1]),
+        spectrum=divided(spectrum, evaluated.shape[1]),
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
@@ -380,13 +388,14 @@ def levels_of(plan: Plan, hops: tuple[HopMoments, ...], *, errors: bool = True) 
     speeds, (slowest, fastest) = rotation.hop_speed_rad_s, _speeds(rotation, hops, plan)[1]
     if rotation.source == "estimated" and not (rotation.settled.all() and fastest < (1 + _VARIED) * slowest):
         speeds = np.full(len(hops), np.nan)  # while the speed changes, orders are not at multiples of the speed found
-    return window_levels(
+    found = window_levels(
         plan.levels,
         [hop.levels for hop in hops if hop.levels is not None],
         speeds,
         phase_reference=rotation.source == "phase reference",
         errors=errors,
     )
+    return replace(found, settled=rotation.settled)
 
 
 def _coherence(shared: ComplexArray | FloatArray, powers: FloatArray) -> FloatArray:

@@ -5,7 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from models.diagnosis.window.excluded import ExcludedLine, KnownLine, excluded_lines, segment_levels, summed
+from models.diagnosis.window.excluded import (
+    ExcludedLine,
+    KnownLine,
+    excluded_lines,
+    of_one_level,
+    segment_levels,
+    summed,
+)
 from models.diagnosis.window.moments import ComplexArray
 from models.signals.block import FloatArray
 from tests.sure import sure
@@ -165,10 +172,18 @@ def levels_of(found: ComplexArray) -> FloatArray | None:
     return segment_levels(found, summed(found), range(4))
 
 
-def test_a_load_that_steps_is_read_from_the_segments() -> None:
-    found = sure(levels_of(segments(STEP)))
+@pytest.mark.parametrize("sources", [4, 1])  # with one, three of four motions are sensor noise, which does not step
+def test_a_load_that_steps_is_read_from_the_segments(sources: int) -> None:
+    found = sure(levels_of(segments(STEP, sources=sources)))
     np.testing.assert_allclose(found, STEP / STEP.mean(), rtol=0.15)
     assert found.mean() == pytest.approx(1)
+
+
+def test_the_most_segments_of_one_level_are_evaluated() -> None:
+    for level in (STEP, 1 / STEP):
+        found = segments(level)
+        np.testing.assert_array_equal(of_one_level(found, level), found[:, STEP == 1] / np.sqrt(level[0]))
+    assert of_one_level(found, np.geomspace(1.0, 1000.0, SEGMENTS)).shape[1] == SEGMENTS  # too few are alike
 
 
 @pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels", "too large", "steady"])

@@ -75,3 +75,8 @@ def test_faint_lines_leave_all_hops_settled() -> None:
     weak = lines(4, 0.01, 0.02, strength=8.0)
     speeds = sure(followed_speeds((*weak[:5], None, *weak[6:]), HOP_S))
     assert settled_hops((*weak[:5], None, *weak[6:]), speeds, HOP_S).all()
+
+
+def test_a_single_hop_is_settled() -> None:
+    (first, *_) = lines(6, 0.01, 0.02, strength=100.0)
+    assert settled_hops((first,), sure(followed_speeds((first,), HOP_S)), HOP_S).tolist() == [True]

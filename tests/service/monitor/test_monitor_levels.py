@@ -192,17 +192,25 @@ def test_levels_are_judged_at_a_speed_not_commissioned() -> None:
 
 
 def drive(
-    seconds: float, speed_hz: Callable[[FloatArray], FloatArray], line: float = 0.0, *, by_angle: bool = True
+    seconds: float,
+    speed_hz: Callable[[FloatArray], FloatArray],
+    line: float = 0.0,
+    *,
+    by_angle: bool = True,
+    length_s: float = 20.0,
+    power: int = 0,
 ) -> tuple[list[tuple[ChannelLevels, ...]], list[tuple[EventKind, str]]]:
     """Levels and alarms of a drive with four first windows and a line at 61 Hz from 100 s on.
 
-    Its speed is known by a shaft angle, or followed in the vibration near 1380 rpm.
+    Its speed is known by a shaft angle, or followed in the vibration near 1380 rpm. Apart from the line, its vibration
+    rises with this `power` of the speed.
     """
     angle = Sensor(name="angle", quantity="shaft_angle", location="shaft", direction="rotation", unit="rad")
     limits = FAN.levels.model_copy(update={"reference_windows": 4})
     alarms_as_windows = FAN.alarms.model_copy(update={"off_delay_s": 20.0})
     known = {"sensors": (*FAN.sensors, angle)} if by_angle else {"operation": Operation(speed_rpm=1380.0)}
-    changes = {**known, "levels": limits, "alarms": alarms_as_windows}
+    window = FAN.window.model_copy(update={"length_s": length_s, "max_span_s": 1.5 * length_s})
+    changes = {**known, "levels": limits, "alarms": alarms_as_windows, "window": window}
     monitor = MachineMonitor(install(FAN.model_copy(update=changes), None))
     rng, size, turned = np.random.default_rng(92), round(BLOCK_S * RATE_HZ), 0.0
     found, alarms = list[tuple[ChannelLevels, ...]](), list[tuple[EventKind, str]]()
@@ -211,6 +219,7 @@ def drive(
         theta = turned + np.cumsum(2 * np.pi * speed_hz(t) / RATE_HZ)
         turned = theta[-1]
         samples = 3.0 * np.cos(theta)[:, None] + 0.3 * rng.standard_normal((size, 2))
+        samples *= np.maximum(speed_hz(t) / 24.8, 0.05)[:, None] ** power
         samples += (line * np.sin(2 * np.pi * 61.0 * t) * (t > 100.0))[:, None]
         every = (np.column_stack([samples, theta % (2 * np.pi)]) if by_angle else samples).astype(np.float32)
         report = monitor.step(SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, every))
@@ -244,6 +253,16 @@ def test_without_a_shaft_angle_no_growth_is_stated_while_the_speed_is_unknown() 
 def test_a_line_stays_raised_while_the_set_point_changes(by_angle: bool) -> None:
     _, alarms = drive(230, set_points(20.0, (41.0, 81.0), (138.5, 183.5)), line=0.6, by_angle=by_angle)
     assert alarms == [(EventKind.RAISED, "level:DE-H"), (EventKind.RAISED, "level:NDE-V")]
+
+
+def test_without_a_shaft_angle_a_stop_and_a_start_are_not_growth() -> None:
+    def stopping(t: FloatArray) -> FloatArray:
+        return np.asarray(np.interp(t, [250.0, 275.0, 330.0, 345.0], [24.8, 0.0, 0.0, 24.8]), dtype=np.float64)
+
+    found, _ = drive(440, stopping, by_angle=False, length_s=60.0, power=2)
+    beyond = {limit.measure for levels in found for one in levels for limit in one.limits if limit.text}
+    assert beyond <= {"overall", "velocity"}  # fallen, as if the sensors had lost their supply
+    assert all(one.growth is not None for levels in (found[48], *found[-4:]) for one in levels)
 
 
 def test_growth_is_found_at_a_speed_that_always_varies() -> None:
