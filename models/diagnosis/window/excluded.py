@@ -9,7 +9,8 @@ The level of the random forces may change within a window, too. The cross-spectr
 equal level. If the level steps or drifts, few segments dominate that mean; it scatters like a mean over fewer segments,
 which looks like a misfit. Scaled to one level, segments of one rotor are alike; those with another rotor, a rub or a
 line are not, and remain a misfit. Sensor noise does not follow the load: motions that are mostly noise do not count for
-the level, and only segments of similar level are evaluated, as scaling also scales their noise.
+the level, and only segments of similar level are evaluated, as scaling also scales their noise. A fault that comes and
+goes raises the level as well, but changes the motion; segments in which it is different are evaluated at any level.
 """
 
 from collections.abc import Sequence
@@ -249,6 +250,7 @@ _BLOCK = 16  # bins that are compared at once: many more than channels, and few 
 _STEADY = 30.0  # variance of the levels, times the coefficients in each, below which a window is stationary; 3 is usual
 _CLEAR, _CLEAR_BLOCKS = 4.0, 5  # power over that of noise, and the fewest blocks: a line is in two of them at most
 _ALIKE = 2.0  # range of the levels evaluated together: sensor noise is scaled with the segments, and then varies itself
+_OTHER = 2.5  # deviation of a segment over the usual one, above which its motion is another; at another load up to 2
 _ROUNDS = 2  # in the first, loud segments weigh too much in the mean that all segments are compared with
 
 
@@ -268,23 +270,34 @@ def segment_levels(segments: ComplexArray, spectrum: ComplexArray, columns: Sequ
     blocks = segments.shape[0] // _BLOCK
     if not n or not blocks:
         return None
-    own = np.take(segments[: blocks * _BLOCK], columns, axis=2).reshape(blocks, _BLOCK, count, n)
+    own = _in_blocks(segments, columns)
     mean = spectrum[: blocks * _BLOCK, columns][:, :, columns].reshape(blocks, _BLOCK, n, n).sum(axis=1)
     if not np.all(np.isfinite(mean)):
         return None
     levels = np.ones(count)
     for _ in range(_ROUNDS):
-        values, axes = np.linalg.eigh(mean)
-        motions = own.reshape(blocks, -1, n) @ axes.conj()
-        powers = (motions.real**2 + motions.imag**2).reshape(own.shape).sum(axis=1)  # (blocks, n_segments, n)
-        usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
-        clear = _clear(values, np.abs(axes) ** 2)
-        levels = np.median((powers / usual).swapaxes(1, 2)[clear], axis=0)
+        powers = _clear_powers(own, mean)
+        levels = np.median(powers, axis=0)
         levels /= max(float(levels.mean()), np.finfo(float).tiny)
-        if np.mean((levels - 1) ** 2) * clear.sum() * _BLOCK < _STEADY or not np.all(levels > 0):
+        if np.mean((levels - 1) ** 2) * len(powers) * _BLOCK < _STEADY or not np.all(levels > 0):
             return None
         mean = summed((own / np.sqrt(levels)[:, np.newaxis]).reshape(blocks, -1, n))
     return levels
+
+
+def _in_blocks(segments: ComplexArray, columns: Sequence[int]) -> ComplexArray:
+    """Channels `columns` of the segments, shape (n_blocks, bins in a block, n_segments, n)."""
+    blocks = segments.shape[0] // _BLOCK
+    return np.take(segments[: blocks * _BLOCK], columns, axis=2).reshape(blocks, _BLOCK, -1, len(columns))
+
+
+def _clear_powers(own: ComplexArray, spectrum: ComplexArray) -> FloatArray:
+    """Powers of segments in the clear motions of `spectrum`, relative to their mean, shape (n_clear, n_segments)."""
+    values, axes = np.linalg.eigh(spectrum)
+    motions = own.reshape(len(own), -1, own.shape[-1]) @ axes.conj()
+    powers = (motions.real**2 + motions.imag**2).reshape(own.shape).sum(axis=1)  # (n_blocks, n_segments, n)
+    usual = np.maximum(powers.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    return np.asarray((powers / usual).swapaxes(1, 2)[_clear(values, np.abs(axes) ** 2)], dtype=np.float64)
 
 
 def _clear(values: FloatArray, shares: FloatArray) -> npt.NDArray[np.bool_]:
@@ -299,10 +312,20 @@ def _clear(values: FloatArray, shares: FloatArray) -> npt.NDArray[np.bool_]:
     return clear if np.count_nonzero(clear.any(axis=1)) >= _CLEAR_BLOCKS else np.ones_like(clear)
 
 
-def of_one_level(segments: ComplexArray, levels: FloatArray) -> ComplexArray:
-    """The most segments whose levels are within a factor of two, scaled to one; all, if those are less than a third."""
+def of_one_level(segments: ComplexArray, levels: FloatArray, columns: Sequence[int]) -> ComplexArray:
+    """The most segments whose levels are within a factor of two, and those of another motion, scaled to one level.
+
+    All, if the former are less than a third. `columns` are one channel of each motion.
+    """
+    scaled = np.asarray(segments / np.sqrt(levels)[:, np.newaxis], dtype=np.complex128)
     order = np.argsort(levels, kind="stable")
     ends = np.searchsorted(levels[order], _ALIKE * levels[order], side="right")
     first = int(np.argmax(ends - np.arange(levels.size)))
-    alike = np.sort(order[first : ends[first]]) if 3 * (ends[first] - first) >= levels.size else np.arange(levels.size)
-    return np.asarray(segments[:, alike] / np.sqrt(levels[alike])[:, np.newaxis], dtype=np.complex128)
+    alike = np.isin(np.arange(levels.size), order[first : ends[first]])
+    if 3 * np.count_nonzero(alike) < levels.size:
+        return scaled
+    own = _in_blocks(scaled, columns)
+    kept = own[:, :, alike]
+    powers = np.maximum(_clear_powers(own, summed(kept.reshape(len(own), -1, len(columns)))), np.finfo(float).tiny)
+    apart = np.sqrt(np.mean(np.log(powers / np.median(powers[:, alike], axis=1, keepdims=True)) ** 2, axis=0))
+    return scaled[:, alike | (apart > _OTHER * np.median(apart[alike]))]

@@ -269,8 +269,9 @@ def window_statistics(
         powers = np.einsum("fii->fi", spectrum).real * (np.abs(angle) ** 2).sum(axis=1, keepdims=True)
         phase_kept = _coherence((by_bin.transpose(0, 2, 1) @ angle[:, :, np.newaxis].conj())[:, :, 0], powers)
     alive = ~np.isin(plan.mounted, lost)
-    levels = segment_levels(by_bin, spectrum, plan.motions(alive))
-    evaluated = by_bin if levels is None else of_one_level(by_bin, levels)
+    motions = plan.motions(alive)
+    levels = segment_levels(by_bin, spectrum, motions)
+    evaluated = by_bin if levels is None else of_one_level(by_bin, levels, motions)
     spectrum = spectrum if levels is None else summed(evaluated)
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(

@@ -182,8 +182,17 @@ def test_a_load_that_steps_is_read_from_the_segments(sources: int) -> None:
 def test_the_most_segments_of_one_level_are_evaluated() -> None:
     for level in (STEP, 1 / STEP):
         found = segments(level)
-        np.testing.assert_array_equal(of_one_level(found, level), found[:, STEP == 1] / np.sqrt(level[0]))
-    assert of_one_level(found, np.geomspace(1.0, 1000.0, SEGMENTS)).shape[1] == SEGMENTS  # too few are alike
+        np.testing.assert_array_equal(of_one_level(found, level, range(4)), found[:, STEP == 1] / np.sqrt(level[0]))
+    assert of_one_level(found, np.geomspace(1.0, 1000.0, SEGMENTS), range(4)).shape[1] == SEGMENTS  # too few are alike
+
+
+@pytest.mark.parametrize("quiet", [0, 4])  # in some of those of usual level, too, the motion is another
+def test_segments_of_another_level_are_evaluated_if_their_motion_is_another(quiet: int) -> None:
+    """A rub that comes and goes: it raises the level of some segments, and changes the motion."""
+    found, rubs = segments(STEP), np.isin(np.arange(SEGMENTS), [*range(quiet), 21, 22, 23])
+    found[:, rubs] = found[:, rubs][:, :, [1, 2, 3, 0]]
+    kept = of_one_level(found, STEP, range(4))
+    np.testing.assert_allclose(np.angle(kept), np.angle(found[:, rubs | (STEP == 1)]))
 
 
 @pytest.mark.parametrize("kind", ["line", "a tenth of the band", "dead channels", "too large", "steady"])
