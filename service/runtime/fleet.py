@@ -235,10 +235,19 @@ class ShardActor:
         self._thread.start()
 
     def said(self, number: int, wait_s: float) -> tuple[str, str] | None:
-        """Its message of this number, and the computer it runs on; None if there is no such message yet."""
+        """Its message of this number, and the computer it runs on; None if there is no such message yet.
+
+        Raises
+        ------
+        EOFError
+            If it has ended without.
+        """
         with self._listening:  # a caller that gave up waiting may ask again before this call has ended
-            if len(self._said) <= number and self._connection.poll(wait_s):
-                self._said.append(self._connection.recv_bytes().decode())
+            try:
+                if len(self._said) <= number and self._connection.poll(wait_s):
+                    self._said.append(self._connection.recv_bytes().decode())
+            except OSError as error:  # it was asked to stop when it had ended already
+                raise EOFError from error
         computer = imported_ray().get_runtime_context().get_node_id()
         return (self._said[number], computer) if len(self._said) > number else None
 

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from rotorwatch.records.health import HealthState
 from service.commands.rotorwatch import app
-from service.runtime.fleet import HEALTH_CHECKS, better_place, fleet_count
+from service.runtime.fleet import HEALTH_CHECKS, ShardActor, better_place, fleet_count
 from service.runtime.runtime import Runtime, running
 from service.runtime.shards import Shards
 from service.settings.service import FleetSettings, HistorySettings, MachineEntry, ServiceSettings
@@ -118,6 +119,17 @@ def test_shards_move_off_a_lost_computer_and_onto_a_new_one(cluster: "Cluster", 
                 assert after[: len(log)] == log
                 assert [event.sequence for event in after] == list(range(len(after)))
                 assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
+
+
+def test_a_shard_that_ended_before_it_was_asked_to_stop_has_no_more_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The request to stop, which nobody has read, resets the connection."""
+    monkeypatch.setattr(ShardActor, "begin", lambda _: None)
+    actor = ShardActor(ServiceSettings(), LinkSettings())
+    actor._connection, theirs = Pipe()
+    actor.ask_to_stop()
+    theirs.close()
+    with pytest.raises(EOFError):
+        actor.said(0, 1.0)
 
 
 def test_offline_replay_on_a_cluster_gives_the_results_of_single_replays(cluster: "Cluster", tmp_path: Path) -> None:
