@@ -5,7 +5,7 @@ healthy recordings only is compared with its baseline (`BaselineEvaluator`) or, 
 channel by channel with its healthy shape.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -16,17 +16,18 @@ from models.commissioning.commissioned import Commissioned, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.isolation import misfit_beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
-from models.diagnosis.verdict.stretch import determined, stretch_of
-from models.diagnosis.window.moments import states_of
+from models.diagnosis.verdict.stretch import determined, stretch_of, with_shared_error
+from models.diagnosis.window.moments import Plan, states_of
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
-from rotorwatch.records.windows import Equation
+from rotorwatch.records.windows import Equation, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, settled
 from service.monitor.known_machine import KnownMachineEvaluator
 
@@ -81,6 +82,22 @@ class BaselineEvaluator(WindowEvaluator):
         self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
         self.takes_short = self._baselines != ()
+        self._drifted = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+
+    def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
+        """Also despite gains that have drifted a little: `heard` widens the readings by them."""
+        return super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
+
+    def heard(self, findings: Sequence[SensorFault]) -> None:
+        """Also take note of gains that have drifted.
+
+        A row's terms are proportional to its channels, so a change of its parameters reads wrong by at most some 1.3
+        times the drift (decision 0062).
+        """
+        super().heard(findings)
+        drifted = [(one.states[0][0], one.value or 0.0) for one in findings if is_drift(one)]
+        by_parameter = [sum(size**2 for plane, size in drifted if name[-1] in (plane, "e")) for name in PARAMETERS]
+        self._drifted = np.diag(by_parameter)
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
@@ -116,7 +133,8 @@ class BaselineEvaluator(WindowEvaluator):
 
     def _diagnose(self, window: WindowStatistics) -> Diagnosis:
         clear = (window.without_lines if self._lines else window).with_steady_rotation
-        return determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
+        read = determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
+        return with_shared_error(read, self._drifted) if self._drifted.any() else read
 
     def _newest(
         self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int

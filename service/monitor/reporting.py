@@ -85,10 +85,11 @@ class WindowReporter:
         if not stood and "theta" not in implicated(findings):
             findings += levels.rewired()
         lost = self.evaluator.spared(self._plan, findings)
-        if lost and not (stood or skipped):
-            remark = "the machine is diagnosed without it"
-            findings = tuple(one.model_copy(update={"text": f"{one.text}; {remark}"}) for one in findings)
         start_ns, faulty = statistics.start_ns, implicated(findings)
+        faulted = lost != () or not faulty.issubset(self._plan.others)
+        if faulted and lost is not None and not (stood or skipped):
+            remark = f"the machine is diagnosed {'without it' if lost else 'with larger errors'}"
+            findings = tuple(one.model_copy(update={"text": f"{one.text}; {remark}"}) for one in findings)
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         self._data_path.sensors(findings, statistics, standing=bool(stood))
@@ -96,7 +97,7 @@ class WindowReporter:
 
         def unread(state: HealthState, reason: str) -> Report:
             levels.tell(self._alarms, end_ns, faulty=faulty, standing=bool(stood))
-            calm = state if lost == () else HealthState.DATA_HEALTH  # a sensor fault takes precedence
+            calm = HealthState.DATA_HEALTH if faulted else state  # a sensor fault takes precedence
             return self.unread(start_ns, end_ns, calm, speed_rad_s=speed, sensors=findings, reason=reason)
 
         if lost is None:
@@ -123,7 +124,7 @@ class WindowReporter:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
         look, length_s = looks[whole].complete(), self._machine.window.length_s
-        calm = evaluation.calm(outside=verdict.outside_model, without=bool(lost))
+        calm = evaluation.calm(outside=verdict.outside_model, without=faulted)
         if not self._plan.states and levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(

@@ -29,6 +29,11 @@ _LEAST_COHERENCE = 0.5  # coherence of bearing and disc across the planes, and h
 _MOST_ERROR = 0.2  # largest standard error of a channel's own change, as part of the disagreement, to name a sensor
 
 
+def is_drift(finding: SensorFault) -> bool:
+    """Whether a gain has changed by no more than is put down to calibration on a machine without a reference."""
+    return finding.kind is FaultKind.GAIN and abs(finding.value or 1.0) < LEAST_GAIN
+
+
 class _Departure:
     """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
@@ -64,7 +69,9 @@ def gain_and_delay(
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
         if steady or moving or departure.reversed:
-            findings.append(_gain(window, departure, departures, naming, reference, moving=moving and not steady))
+            # Soon after a gain has changed, its mean over the window is little of that.
+            moving &= not steady or abs(departure.course_step) > abs(departure.log_gain)
+            findings.append(_gain(window, departure, departures, naming, reference, moving=moving))
         if not departure.known and abs(departure.reading.lead_rad_s) > MOST_LEAD_RAD_S:
             findings.append(_lead(departure.reading, naming))
         elif late:

@@ -219,7 +219,8 @@ def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis
         if one.name == "e" and unbalance is not None:
             vector = unbalance = unbalance.widened(error**2 - (one.standard_error or 0.0) ** 2)
         parameters.append(parameter_reading(one.name, one.by, one.relative_change, error, vector))
-    return replace(diagnosis, covariance=total, common=shared, unbalance=unbalance, parameters=tuple(parameters))
+    common = shared if diagnosis.common is None else diagnosis.common + shared
+    return replace(diagnosis, covariance=total, common=common, unbalance=unbalance, parameters=tuple(parameters))
 
 
 def _stated(

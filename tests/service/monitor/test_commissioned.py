@@ -84,6 +84,37 @@ def test_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter() -> N
     assert not any(window.parameters for window in full(windows))
 
 
+def with_gain(factor: float, healthy: Sequence[SampleBlock]) -> Sequence[SampleBlock]:
+    """Blocks in which the velocity of the disc, horizontal, is multiplied by a factor."""
+    scale = np.where([sensor.name == "y2_dot" for sensor in MACHINE.sensors], factor, 1.0)
+    return with_samples(healthy, samples_of(healthy) * scale)
+
+
+@pytest.mark.parametrize("change", [0.0, -0.35])
+def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(change: float) -> None:
+    """Which of the two sensors has drifted is not known: the reading of k_by may be wrong by all of it."""
+    event = Event(at_s=0.0, parameter="k_by", relative_change=change)
+    ran = stream(65.0, SEED + 2, *([event] if change else []))
+    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, with_gain(1.03, ran)))
+    raised = {event.alarm.name for event in drifted[1] if not event.alarm.name.startswith(LEVEL)}
+    assert raised == {"data-gain"} | ({"k_by"} if change else set())
+    last = full(drifted[0])[-1]
+    assert last.state is (HealthState.DANGER if change else HealthState.DATA_HEALTH)
+    assert "diagnosed with larger errors" in last.sensors[0].text
+    before, now = (
+        {one.name: sure(one.standard_error) for one in full(fed[0])[-1].parameters[:5]} for fed in (plain, drifted)
+    )
+    for name in ("k_by", "c_by", "e"):
+        assert now[name] > 0.9 * np.hypot(before[name], 0.03 * (1 + change * (name == "k_by")))
+    assert now["k_bz"] < 1.1 * before["k_bz"]
+
+
+def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
+    windows, events = feed(MachineMonitor(installed()), with_gain(1.08, stream(65.0, SEED + 1)))
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
+    assert not any(window.parameters for window in full(windows))
+
+
 def test_a_change_within_the_window_is_named_and_not_outside_the_model() -> None:
     """Windows across the change fit neither state of the machine; their latest data fit."""
     begins_s = 63.0
