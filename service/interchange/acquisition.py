@@ -8,11 +8,13 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from models.signals.block import nanoseconds
 from service.interchange.source import (
     CHUNK_ROWS,
     ONE_RATE,
@@ -70,6 +72,17 @@ class TdmsSource(Source):
         properties = self._column(column).properties
         return str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
 
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time; an error says if the file is truncated, which leaves columns unequally long."""
+        try:
+            yield from super().chunks(columns)
+        except SourceError as error:
+            if not self._tdms.file_status.incomplete_final_segment:
+                raise
+            raise SourceError(
+                f"{error}; the file ends within a segment: it is truncated, or still being written"
+            ) from error
+
     def close(self) -> None:
         """Close the file."""
         self._tdms.close()
@@ -107,7 +120,8 @@ class MdfSource(Source):
 
     kind, package, entry = "MF4", "asammdf", "channel"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, zone: tzinfo = UTC) -> None:
+        self._zone = zone
         places: dict[str, tuple[int, int]] = {}
         with readable(path, self.kind, self.package):
             from asammdf import MDF  # noqa: PLC0415  # an extra
@@ -126,11 +140,15 @@ class MdfSource(Source):
         super().__init__(path, {"time": None} | places)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
-        """Start of the measurement; every row has its own time."""
-        began = self._file.header.start_time
-        offset = began.utcoffset()
-        start_ns = int(np.datetime64(began.replace(tzinfo=None), "ns").astype(np.int64))
-        start_ns -= 0 if offset is None else round(offset.total_seconds() * 1e9)
+        """Start of the measurement, in `zone` if the file names none; every row has its own time."""
+        header, start_ns = self._file.header, None
+        with suppress(ValueError):
+            if hasattr(header, "date") and not getattr(header, "abs_time", 0):
+                # MDF before 3.2: local time, which the library would take for that of this computer.
+                began = datetime.strptime(f"{header.date.decode()} {header.time.decode()}", "%d:%m:%Y %H:%M:%S")
+            else:
+                began = header.start_time
+            start_ns = nanoseconds(began if began.tzinfo else began.replace(tzinfo=self._zone))
         return Timing(start_ns=start_ns, time=Reference("time"))
 
     def unit(self, column: Reference) -> str:
@@ -138,7 +156,7 @@ class MdfSource(Source):
         if column.column == "time":
             return "s"
         group, index = self._column(column)
-        return str(self._file.groups[group].channels[index].unit or "")
+        return str(self._file.get_channel_unit(group=group, index=index) or "")
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, `CHUNK_ROWS` at a time; channels of several groups must have the same times."""
@@ -156,9 +174,7 @@ class MdfSource(Source):
                 for reference, signal in zip(asked, present, strict=True):
                     if np.abs(signal.timestamps - present[0].timestamps).max(initial=0.0) > _SAME_TIME_S:
                         raise SourceError(f"{self.path}: channels {asked[0]} and {reference} have different times")
-                yield tuple(
-                    present[0].timestamps if signal is None else np.asarray(signal.samples) for signal in signals
-                )
+                yield tuple(present[0].timestamps if signal is None else _valid(signal) for signal in signals)
 
     def values(self, column: str) -> Array:
         """Read a channel whole."""
@@ -171,7 +187,19 @@ class MdfSource(Source):
         self._file.close()
 
     def _read(self, place: tuple[int, int], first: int) -> Any:
-        return self._file.get(group=place[0], index=place[1], record_offset=first, record_count=CHUNK_ROWS)
+        return self._file.get(
+            group=place[0],
+            index=place[1],
+            record_offset=first,
+            record_count=CHUNK_ROWS,
+            ignore_invalidation_bits=True,  # otherwise invalid samples are left out, and channels have other lengths
+        )
+
+
+def _valid(signal: Any) -> Array:
+    """Samples of an MF4 channel, NaN where the file marks them as invalid."""
+    samples, invalid = np.asarray(signal.samples), signal.invalidation_bits
+    return samples if invalid is None or not np.any(invalid) else np.where(invalid, np.nan, samples)
 
 
 class UniversalSource(Source):
