@@ -5,10 +5,13 @@ responses in data set 58 (functions at nodal degrees of freedom) of the Universa
 """
 
 import logging
+import os
 import re
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, tzinfo
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,9 @@ from service.interchange.source import (
 from service.monitor.conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
+_FIRST_SEGMENTS = 8  # of a TDMS file, in which the first samples are looked for
+_BIG_ENDIAN = 0x40  # bit of a TDMS segment's table of contents
+_UNFINISHED = 2**64 - 1  # in place of a TDMS segment's length while it is being written
 _TIME_RESPONSE = 1
 _MOST_RATE_DIFFERENCE = 1e-6
 
@@ -57,8 +63,18 @@ class TdmsSource(Source):
     def timing(self, columns: Sequence[Reference]) -> Timing:
         """Rate and start of the waveforms (``wf_increment``, ``wf_start_time``, ``wf_start_offset``)."""
         found: Timing | None = None
+        first = self._first_stated() if columns else {}
         for reference in columns:
-            timing = _waveform(self._column(reference).properties)
+            channel = self._column(reference)
+            timing = _waveform(channel.properties)
+            begun_ns = _waveform(first.get(channel.path, {})).start_ns or 0
+            lasts_ns = len(channel) / timing.rate_hz * 1e9 if timing.rate_hz else float("inf")
+            if begun_ns > 0 and (timing.start_ns or 0) - begun_ns > lasts_ns:  # before 1970: not set, as 1904 is
+                raise SourceError(
+                    f"{self.path}: channel {reference} begins at {rfc3339(begun_ns)} and anew at "
+                    f"{rfc3339(timing.start_ns or 0)}, longer after that than its {len(channel)} samples last: several "
+                    "measurements with a gap that is not kept; expected a file for each"
+                )
             if found is not None and timing != found:
                 raise SourceError(
                     f"{self.path}: channel {reference} has {_told(timing)}, channel {columns[0]} has {_told(found)}; "
@@ -66,6 +82,26 @@ class TdmsSource(Source):
                 )
             found = timing
         return found or Timing()
+
+    def _first_stated(self) -> dict[str, Any]:
+        """Properties of channels at their first samples; the library keeps those of the last segment."""
+        from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+
+        index = b""
+        with readable(self.path, self.kind), self.path.open("rb") as file:
+            for _ in range(_FIRST_SEGMENTS):
+                lead = file.read(28)
+                if len(lead) < 28:
+                    break
+                following, data_from = struct.unpack_from((">" if lead[4] & _BIG_ENDIAN else "<") + "QQ", lead, 12)
+                if following == _UNFINISHED:
+                    break
+                index += b"TDSh" + lead[4:] + file.read(data_from)  # as in the file of type .tdms_index
+                groups = TdmsFile.read_metadata(BytesIO(index)).groups()
+                if any(len(channel) for group in groups for channel in group.channels()):
+                    return {channel.path: channel.properties for group in groups for channel in group.channels()}
+                file.seek(following - data_from, os.SEEK_CUR)
+        return {}
 
     def unit(self, column: Reference) -> str:
         """Property ``unit_string``, or ``NI_UnitDescription`` as written by NI-DAQ."""

@@ -358,3 +358,26 @@ def test_the_error_for_an_unknown_format_lists_the_known_ones(tmp_path: Path) ->
     (tmp_path / "run.xyz").write_text("1,2")
     with pytest.raises(SourceError, match=r"'\.xyz' is not known.*\.tdms"):
         imported(tmp_path, tmp_path / "run.xyz", SAMPLED + CHANNELS)
+
+
+def test_a_tdms_file_whose_writer_was_killed_is_read(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    path = tmp_path / "run.tdms"
+    write_tdms(path, {"t": t, "x": x, "v": v, "a": a})
+    first = path.read_bytes()
+    path.write_bytes(
+        first[:12] + bytes(8 * [255]) + first[20 : first.index(b"TDSm", 28)]
+    )  # its length is not known yet
+    (found,) = stretches(imported(tmp_path, path, CHANNELS)[1])
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, a]))
+
+
+def test_measurements_that_were_appended_to_a_tdms_file_are_refused(tmp_path: Path) -> None:
+    with nptdms.TdmsWriter(str(tmp_path / "run.tdms")) as writer:
+        writer.write_segment([nptdms.RootObject({"title": "two runs"})])
+        for start in ("2026-01-31T12:00:00", "2026-01-31T13:00:00"):
+            known = {"wf_increment": 1 / RATE_HZ, "wf_start_time": np.datetime64(start, "us"), "wf_start_offset": 0.0}
+            columns = zip("xva", signals(1000)[1:], strict=True)
+            writer.write_segment([nptdms.ChannelObject("run", name, column, known) for name, column in columns])
+    with pytest.raises(SourceError, match=r"channel x begins at 2026-01-31T12:00:00.* and anew at 2026-01-31T13:00:00"):
+        imported(tmp_path, tmp_path / "run.tdms", CHANNELS)
