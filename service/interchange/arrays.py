@@ -150,6 +150,11 @@ class WavSource(_Arrays):
                 name, size = struct.unpack(f"{order}4sI", head)
                 if name == b"data":
                     size, there = long_size or size, path.stat().st_size - file.tell()
+                    if size == 0 and there >= frame:
+                        raise SourceError(
+                            f"{path}: was not finished: its header says 0 samples, but {there // frame} of each "
+                            "channel follow; repair it, such as with sox --ignore-length"
+                        )
                     if size == _UNKNOWN_SIZE or size <= there:
                         return
                     raise SourceError(

@@ -154,7 +154,8 @@ class CsvSource(_Table):
     def _error_text(self, error: Exception) -> str:
         """Arrow's message, rows counted from 1 without header lines; for one after many good rows, with a remedy."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
-        text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
+        printed = "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in str(error))
+        text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", printed)
         short = re.search(r"row (\d+): Expected \d+ columns", text)
         return text + _NO_ROW if short and int(short[1]) > _HEAD else text
 

@@ -247,10 +247,11 @@ def test_dates_without_a_time_zone_are_in_that_of_the_mapping(tmp_path: Path, fo
     else:
         with asammdf.MDF(version={"mf4": "4.10", "mdf": "2.14"}[form]) as file:
             file.start_time = datetime(2026, 1, 31, 12)  # the file says local time, without a zone
-            file.append([asammdf.Signal(column, t, name=name) for name, column in zip("xva", (x, v, a), strict=True)])
+            columns = zip(UNITS, (x, v, a), strict=True)
+            file.append([asammdf.Signal(column, t, name=name, unit=unit) for (name, unit), column in columns])
             file.save(path)
-    column = 'column = "t"\nunit = "datetime"\n' if form == "npz" else ""
-    mapping = f'[time]\nzone = "America/New_York"\n{column}{CHANNELS}'
+    rest = f'column = "t"\nunit = "datetime"\n{CHANNELS}' if form == "npz" else without_units(CHANNELS)
+    mapping = f'[time]\nzone = "America/New_York"\n{rest}'
     (found,) = stretches(imported(tmp_path, path, mapping)[1])
     assert found.start_ns == START_NS + 5 * 3600 * 10**9
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, a]))

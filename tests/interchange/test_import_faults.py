@@ -166,6 +166,11 @@ def test_a_truncated_wav_file_is_refused_with_its_sample_counts(tmp_path: Path, 
     said = "is truncated: 600 samples of each channel are there, expected the 1000"
     with pytest.raises(MachineFileError, match=said):
         imported(tmp_path, tmp_path / "run.wav", mapping)
+    # Its writer was killed before it knew the length.
+    size_at = whole.index(b"data") + 4
+    (tmp_path / "run.wav").write_bytes(whole[:size_at] + bytes(4) + whole[size_at + 4 :])
+    with pytest.raises(MachineFileError, match="was not finished: its header says 0 samples, but 1000 of each channel"):
+        imported(tmp_path, tmp_path / "run.wav", mapping)
 
 
 def test_a_speed_is_no_shaft_angle(tmp_path: Path) -> None:
@@ -232,6 +237,13 @@ def test_a_header_in_another_encoding_is_refused_naming_the_setting(tmp_path: Pa
         imported(tmp_path, source, TEXT)
     done, _ = imported(tmp_path, source, '[csv]\nencoding = "latin-1"\n' + TEXT)
     assert done.written.samples == 1000
+
+
+def test_bytes_that_are_no_text_are_not_sent_to_the_terminal(tmp_path: Path) -> None:
+    rows = [*GOOD[:5], "\x1b[2J\x07", *GOOD[5:]]
+    assert "row 6: Expected 4 columns, got 1: \N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER};" in fault(
+        tmp_path, rows, TEXT
+    )
 
 
 def test_a_table_in_utf_16_is_named(tmp_path: Path) -> None:
