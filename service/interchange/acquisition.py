@@ -5,14 +5,19 @@ responses in data set 58 (functions at nodal degrees of freedom) of the Universa
 """
 
 import logging
+import os
 import re
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime, tzinfo
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from models.signals.block import nanoseconds
 from service.interchange.source import (
     CHUNK_ROWS,
     ONE_RATE,
@@ -27,6 +32,9 @@ from service.interchange.source import (
 from service.monitor.conversion import rfc3339
 
 _SAME_TIME_S = 1e-9
+_FIRST_SEGMENTS = 8  # of a TDMS file, in which the first samples are looked for
+_BIG_ENDIAN = 0x40  # bit of a TDMS segment's table of contents
+_UNFINISHED = 2**64 - 1  # in place of a TDMS segment's length while it is being written
 _TIME_RESPONSE = 1
 _MOST_RATE_DIFFERENCE = 1e-6
 
@@ -55,8 +63,18 @@ class TdmsSource(Source):
     def timing(self, columns: Sequence[Reference]) -> Timing:
         """Rate and start of the waveforms (``wf_increment``, ``wf_start_time``, ``wf_start_offset``)."""
         found: Timing | None = None
+        first = self._first_stated() if columns else {}
         for reference in columns:
-            timing = _waveform(self._column(reference).properties)
+            channel = self._column(reference)
+            timing = _waveform(channel.properties)
+            begun_ns = _waveform(first.get(channel.path, {})).start_ns or 0
+            lasts_ns = len(channel) / timing.rate_hz * 1e9 if timing.rate_hz else float("inf")
+            if begun_ns > 0 and (timing.start_ns or 0) - begun_ns > lasts_ns:  # before 1970: not set, as 1904 is
+                raise SourceError(
+                    f"{self.path}: channel {reference} begins at {rfc3339(begun_ns)} and anew at "
+                    f"{rfc3339(timing.start_ns or 0)}, longer after that than its {len(channel)} samples last: several "
+                    "measurements with a gap that is not kept; expected a file for each"
+                )
             if found is not None and timing != found:
                 raise SourceError(
                     f"{self.path}: channel {reference} has {_told(timing)}, channel {columns[0]} has {_told(found)}; "
@@ -65,10 +83,41 @@ class TdmsSource(Source):
             found = timing
         return found or Timing()
 
+    def _first_stated(self) -> dict[str, Any]:
+        """Properties of channels at their first samples; the library keeps those of the last segment."""
+        from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+
+        index = b""
+        with readable(self.path, self.kind), self.path.open("rb") as file:
+            for _ in range(_FIRST_SEGMENTS):
+                lead = file.read(28)
+                if len(lead) < 28:
+                    break
+                following, data_from = struct.unpack_from((">" if lead[4] & _BIG_ENDIAN else "<") + "QQ", lead, 12)
+                if following == _UNFINISHED:
+                    break
+                index += b"TDSh" + lead[4:] + file.read(data_from)  # as in the file of type .tdms_index
+                groups = TdmsFile.read_metadata(BytesIO(index)).groups()
+                if any(len(channel) for group in groups for channel in group.channels()):
+                    return {channel.path: channel.properties for group in groups for channel in group.channels()}
+                file.seek(following - data_from, os.SEEK_CUR)
+        return {}
+
     def unit(self, column: Reference) -> str:
         """Property ``unit_string``, or ``NI_UnitDescription`` as written by NI-DAQ."""
         properties = self._column(column).properties
         return str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time; an error says if the file is truncated, which leaves columns unequally long."""
+        try:
+            yield from super().chunks(columns)
+        except SourceError as error:
+            if not self._tdms.file_status.incomplete_final_segment:
+                raise
+            raise SourceError(
+                f"{error}; the file ends within a segment: it is truncated, or still being written"
+            ) from error
 
     def close(self) -> None:
         """Close the file."""
@@ -107,7 +156,8 @@ class MdfSource(Source):
 
     kind, package, entry = "MF4", "asammdf", "channel"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, zone: tzinfo = UTC) -> None:
+        self._zone = zone
         places: dict[str, tuple[int, int]] = {}
         with readable(path, self.kind, self.package):
             from asammdf import MDF  # noqa: PLC0415  # an extra
@@ -126,11 +176,15 @@ class MdfSource(Source):
         super().__init__(path, {"time": None} | places)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
-        """Start of the measurement; every row has its own time."""
-        began = self._file.header.start_time
-        offset = began.utcoffset()
-        start_ns = int(np.datetime64(began.replace(tzinfo=None), "ns").astype(np.int64))
-        start_ns -= 0 if offset is None else round(offset.total_seconds() * 1e9)
+        """Start of the measurement, in `zone` if the file names none; every row has its own time."""
+        header, start_ns = self._file.header, None
+        with suppress(ValueError):
+            if hasattr(header, "date") and not getattr(header, "abs_time", 0):
+                # MDF before 3.2: local time, which the library would take for that of this computer.
+                began = datetime.strptime(f"{header.date.decode()} {header.time.decode()}", "%d:%m:%Y %H:%M:%S")
+            else:
+                began = header.start_time
+            start_ns = nanoseconds(began if began.tzinfo else began.replace(tzinfo=self._zone))
         return Timing(start_ns=start_ns, time=Reference("time"))
 
     def unit(self, column: Reference) -> str:
@@ -138,7 +192,7 @@ class MdfSource(Source):
         if column.column == "time":
             return "s"
         group, index = self._column(column)
-        return str(self._file.groups[group].channels[index].unit or "")
+        return str(self._file.get_channel_unit(group=group, index=index) or "")
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, `CHUNK_ROWS` at a time; channels of several groups must have the same times."""
@@ -156,9 +210,7 @@ class MdfSource(Source):
                 for reference, signal in zip(asked, present, strict=True):
                     if np.abs(signal.timestamps - present[0].timestamps).max(initial=0.0) > _SAME_TIME_S:
                         raise SourceError(f"{self.path}: channels {asked[0]} and {reference} have different times")
-                yield tuple(
-                    present[0].timestamps if signal is None else np.asarray(signal.samples) for signal in signals
-                )
+                yield tuple(present[0].timestamps if signal is None else _valid(signal) for signal in signals)
 
     def values(self, column: str) -> Array:
         """Read a channel whole."""
@@ -171,7 +223,19 @@ class MdfSource(Source):
         self._file.close()
 
     def _read(self, place: tuple[int, int], first: int) -> Any:
-        return self._file.get(group=place[0], index=place[1], record_offset=first, record_count=CHUNK_ROWS)
+        return self._file.get(
+            group=place[0],
+            index=place[1],
+            record_offset=first,
+            record_count=CHUNK_ROWS,
+            ignore_invalidation_bits=True,  # otherwise invalid samples are left out, and channels have other lengths
+        )
+
+
+def _valid(signal: Any) -> Array:
+    """Samples of an MF4 channel, NaN where the file marks them as invalid."""
+    samples, invalid = np.asarray(signal.samples), signal.invalidation_bits
+    return samples if invalid is None or not np.any(invalid) else np.where(invalid, np.nan, samples)
 
 
 class UniversalSource(Source):

@@ -40,11 +40,11 @@ class _Arrays(Source):
 
 
 class NumpySource(_Arrays):
-    """A NumPy .npz file, read whole. Pickled objects are refused: they could run code."""
+    """A NumPy .npz file, read whole; its dates are in `zone`. Pickled objects are refused: they could run code."""
 
     kind = "NumPy .npz"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, zone: str = "UTC") -> None:
         with readable(path, self.kind):
             archive = np.load(path, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -53,12 +53,23 @@ class NumpySource(_Arrays):
                 arrays = {}
                 for name in archive.files:
                     try:
-                        arrays[name] = archive[name]
+                        arrays[name] = _in_utc(archive[name], zone)
                     except ValueError as error:
                         if "allow_pickle" not in str(error):
                             raise
                         # Object arrays hold no samples; the other arrays can still be used.
             super().__init__(path, arrays)
+
+
+def _in_utc(array: Array, zone: str) -> Array:
+    """Convert dates, which have no time zone of their own in NumPy, from `zone`; other arrays stay as they are."""
+    if zone == "UTC" or array.dtype.kind != "M":
+        return array
+    import pyarrow as pa  # noqa: PLC0415  # slow to import; only for these files
+
+    from service.interchange.tables import as_array, of_zone  # noqa: PLC0415
+
+    return as_array(of_zone(pa.array(array.ravel().astype("datetime64[ns]")), zone)).reshape(array.shape)
 
 
 class MatlabSource(_Arrays):
@@ -90,11 +101,15 @@ class MatlabSource(_Arrays):
                 super().__init__(path, dict(chain.from_iterable(own)))
 
     def unit(self, column: Reference) -> str:
-        """Attribute ``unit`` or ``units`` of an HDF5 data set; MATLAB writes none."""
+        """Attribute ``unit`` or ``units`` of an HDF5 data set; MATLAB writes none.
+
+        Where `scale_factor` turns the numbers into that unit, it says so, so that they are not taken for values in it.
+        """
         attributes = getattr(self._columns[column.column], "attrs", {})
         stated = np.ravel(attributes.get("unit", attributes.get("units", "")))
         one = stated[0] if stated.size == 1 else ""
-        return one.decode(errors="replace") if isinstance(one, bytes) else str(one) if isinstance(one, str) else ""
+        text = one.decode(errors="replace") if isinstance(one, bytes) else str(one) if isinstance(one, str) else ""
+        return f"{text} after scale_factor".lstrip() if "scale_factor" in attributes else text
 
     def close(self) -> None:
         """Close the file, if it is still open."""
@@ -135,6 +150,11 @@ class WavSource(_Arrays):
                 name, size = struct.unpack(f"{order}4sI", head)
                 if name == b"data":
                     size, there = long_size or size, path.stat().st_size - file.tell()
+                    if size == 0 and there >= frame:
+                        raise SourceError(
+                            f"{path}: was not finished: its header says 0 samples, but {there // frame} of each "
+                            "channel follow; repair it, such as with sox --ignore-length"
+                        )
                     if size == _UNKNOWN_SIZE or size <= there:
                         return
                     raise SourceError(
@@ -191,7 +211,7 @@ def _collect_hdf5(found: dict[str, Any], name: str, item: Any, within: tuple[str
     Cells, and fields of struct arrays, are references to objects elsewhere in the file, which are followed.
     """
     name = place + name
-    if name.startswith("#") or not hasattr(item, "shape"):
+    if name.startswith("#") or getattr(item, "shape", None) is None:  # a group, or a data set without any value
         return
     if item.dtype.kind == "O" and item.dtype.metadata and "ref" in item.dtype.metadata:
         parent, _, field = name.rpartition("/")

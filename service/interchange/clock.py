@@ -91,6 +91,11 @@ def clock_for(
                 f"{path}: column {column} holds numbers ({first.dtype}) such as {first[0]}, expected dates (time.unit "
                 'is "datetime"); for numbers, give s, ms, d, ... as time.unit and when they are 0 as time.start'
             )
+        if first.dtype.kind == "M" and base.start is not None:
+            raise SourceError(
+                f"{path}: column {column} holds dates such as {first[0]}, expected no time.start but time.unit = "
+                '"datetime" in the mapping'
+            )
         measured, tolerance = _measured_rate(path, column, _since(entries, first, unit_ns))
         if first.dtype.kind == "M":
             origin_ns = int(first.astype("datetime64[ns]").astype(np.int64)[0])
@@ -170,7 +175,7 @@ def _measured_rate(path: Path, column: Reference, times: FloatArray) -> tuple[fl
     """Rate of a time column, gaps left out, to its first uncertain digit; and its relative error from jitter."""
     steps = np.diff(times)
     check_order(path, column, times, 0)
-    usual = float(np.median(steps))
+    usual = float(np.percentile(steps, 50, method="lower"))  # a step that occurs, even if others are as many
     within = steps[np.abs(steps - usual) <= 0.5 * usual]
     step = float(within.mean())
     rate_hz, error = 1e9 / step, 2 * float(np.abs(within - step).max()) / (step * within.size)

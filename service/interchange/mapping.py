@@ -63,7 +63,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
     )
     zone: str | None = Field(
         default=None,
-        description="time zone of dates and times without one, in the time column and in file names, such as "
+        description="time zone of dates and times without one, in the file and in file names, such as "
         "Europe/Berlin or +01:00; UTC if left out",
     )
     rate_hz: float | None = Field(default=None, gt=0, le=1e6, description="samples per second where no column says so")
@@ -207,8 +207,10 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
                 f"or name the file {suffixes}"
             )
         options: dict[str, Any] = {}
-        if kind in {Format.CSV, Format.PARQUET}:
+        if kind in {Format.CSV, Format.PARQUET, Format.NPZ}:
             options["zone"] = base.zone or "UTC"
+        if kind is Format.MF4:
+            options["zone"] = base.time_zone
         if kind is Format.CSV:
             options |= {"form": self.csv, "time_column": base.column, "datetimes": base.is_datetime}
         return kind.open(path, **options)

@@ -1,5 +1,6 @@
 """Sources that hold tables: CSV and Parquet, read piece by piece through Arrow."""
 
+import codecs
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -68,6 +69,10 @@ class CsvSource(_Table):
             if not isinstance(error.__cause__, pa.ArrowInvalid | UnicodeError) or not path.stat().st_size:
                 raise
             told = self._error_text(error)
+            with path.open("rb") as file:
+                if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+                    told = f'{path}: is in UTF-16; write encoding = "utf-16" in [csv] in the mapping'
+                    raise SourceError(told) from error
             if told.endswith(_NO_ROW):
                 raise SourceError(told) from error
             raise SourceError(
@@ -144,12 +149,13 @@ class CsvSource(_Table):
         )
 
     def _array(self, name: str, column: Any) -> Array:
-        return _array(_utc(column, self._zone) if self._is_datetime(name) else column)
+        return as_array(_utc(column, self._zone) if self._is_datetime(name) else column)
 
     def _error_text(self, error: Exception) -> str:
         """Arrow's message, rows counted from 1 without header lines; for one after many good rows, with a remedy."""
         before = self._form.skip_lines + self._form.header + self._form.skip_lines_after_header
-        text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", str(error))
+        printed = "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in str(error))
+        text = re.sub(r"Row #(\d+)", lambda found: f"row {int(found[1]) - before}", printed)
         short = re.search(r"row (\d+): Expected \d+ columns", text)
         return text + _NO_ROW if short and int(short[1]) > _HEAD else text
 
@@ -230,7 +236,7 @@ class ParquetSource(_Table):
         # With pre_buffer, Arrow would keep everything that it has read in memory.
         with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
-                yield tuple(_array(_of_zone(batch.column(name), self._zone)) for name in wanted)
+                yield tuple(as_array(of_zone(batch.column(name), self._zone)) for name in wanted)
 
 
 def _utc(cells: Any, zone: str) -> Any:
@@ -238,10 +244,10 @@ def _utc(cells: Any, zone: str) -> Any:
     zoned = pa.compute.match_substring_regex(cells, _ZONED)
     in_utc = pa.compute.binary_join_element_wise(cells, "Z", "")
     times = pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))
-    return times if zone == "UTC" else pa.compute.if_else(zoned, times, _of_zone(times.cast(pa.timestamp("ns")), zone))
+    return times if zone == "UTC" else pa.compute.if_else(zoned, times, of_zone(times.cast(pa.timestamp("ns")), zone))
 
 
-def _of_zone(times: Any, zone: str) -> Any:
+def of_zone(times: Any, zone: str) -> Any:
     """Convert timestamps without a time zone from `zone` to UTC; for an hour that occurs twice, the first is taken."""
     if zone == "UTC" or not pa.types.is_timestamp(times.type) or times.type.tz is not None:
         return times
@@ -249,7 +255,7 @@ def _of_zone(times: Any, zone: str) -> Any:
     return since.cast(pa.timestamp("ns", tz="UTC"))
 
 
-def _array(column: Any) -> Array:
+def as_array(column: Any) -> Array:
     """Convert an Arrow column to NumPy, with NaN for missing numbers and NaT for missing times."""
     if pa.types.is_timestamp(column.type):
         return np.asarray(column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False))

@@ -234,6 +234,29 @@ def test_dates_in_a_parquet_file_have_their_own_time_zone_or_the_mappings(
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
+@pytest.mark.parametrize("form", ["npz", "mf4", "mdf"])
+def test_dates_without_a_time_zone_are_in_that_of_the_mapping(tmp_path: Path, form: str) -> None:
+    import asammdf  # noqa: PLC0415  # it takes seconds, and every worker reads this module
+
+    t, x, v, a = signals(3000)
+    path = tmp_path / f"run.{form}"
+    if form == "npz":
+        dates = np.datetime64("2026-01-31T12:00:00", "us") + 500 * np.arange(3000)
+        np.savez(path, t=dates, x=x, v=v, a=a)
+    else:
+        with asammdf.MDF(version={"mf4": "4.10", "mdf": "2.14"}[form]) as file:
+            file.start_time = datetime(2026, 1, 31, 12)  # the file says local time, without a zone
+            columns = zip(UNITS, (x, v, a), strict=True)
+            file.append([asammdf.Signal(column, t, name=name, unit=unit) for (name, unit), column in columns])
+            file.save(path)
+    rest = f'column = "t"\nunit = "datetime"\n{CHANNELS}' if form == "npz" else without_units(CHANNELS)
+    mapping = f'[time]\nzone = "America/New_York"\n{rest}'
+    (found,) = stretches(imported(tmp_path, path, mapping)[1])
+    assert found.start_ns == START_NS + 5 * 3600 * 10**9
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, a]))
+
+
 @pytest.mark.parametrize(
     "written", ["dates", "bare dates", "mixed dates", "local dates", "nanoseconds", "milliseconds"]
 )
@@ -323,7 +346,39 @@ def test_a_truncated_measurement_is_named_without_library_warnings(tmp_path: Pat
     gc.collect()  # unclosed files would warn now
 
 
+def test_a_truncated_tdms_file_is_named(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    path = tmp_path / "run.tdms"
+    write_tdms(path, {"t": t, "x": x, "v": v, "a": a})
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(SourceError, match=r"has \d+ rows, .*; the file ends within a segment: it is truncated"):
+        imported(tmp_path, path, CHANNELS)
+
+
 def test_the_error_for_an_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "run.xyz").write_text("1,2")
     with pytest.raises(SourceError, match=r"'\.xyz' is not known.*\.tdms"):
         imported(tmp_path, tmp_path / "run.xyz", SAMPLED + CHANNELS)
+
+
+def test_a_tdms_file_whose_writer_was_killed_is_read(tmp_path: Path) -> None:
+    t, x, v, a = signals(1000)
+    path = tmp_path / "run.tdms"
+    write_tdms(path, {"t": t, "x": x, "v": v, "a": a})
+    first = path.read_bytes()
+    path.write_bytes(
+        first[:12] + bytes(8 * [255]) + first[20 : first.index(b"TDSm", 28)]
+    )  # its length is not known yet
+    (found,) = stretches(imported(tmp_path, path, CHANNELS)[1])
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, a]))
+
+
+def test_measurements_that_were_appended_to_a_tdms_file_are_refused(tmp_path: Path) -> None:
+    with nptdms.TdmsWriter(str(tmp_path / "run.tdms")) as writer:
+        writer.write_segment([nptdms.RootObject({"title": "two runs"})])
+        for start in ("2026-01-31T12:00:00", "2026-01-31T13:00:00"):
+            known = {"wf_increment": 1 / RATE_HZ, "wf_start_time": np.datetime64(start, "us"), "wf_start_offset": 0.0}
+            columns = zip("xva", signals(1000)[1:], strict=True)
+            writer.write_segment([nptdms.ChannelObject("run", name, column, known) for name, column in columns])
+    with pytest.raises(SourceError, match=r"channel x begins at 2026-01-31T12:00:00.* and anew at 2026-01-31T13:00:00"):
+        imported(tmp_path, tmp_path / "run.tdms", CHANNELS)

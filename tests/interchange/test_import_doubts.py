@@ -176,6 +176,7 @@ def test_rates_and_units_of_an_hdf5_file_are_read(tmp_path: Path, attribute: obj
         for name, column in zip("xva", signals(1000)[1:], strict=True):
             file[name] = column
         file["x"].attrs["units"] = attribute
+        file["comment"] = h5py.Empty("f8")  # a data set without any value, which is none of the columns
         file["fs"] = 2000.0
     mapping = TEXT.replace('column = "t"', 'rate_from = "fs"')
     if refused:
@@ -194,3 +195,23 @@ def test_a_speed_range_is_reported_beside_the_mean(tmp_path: Path, faster_hz: fl
     mapping = f'{PULSES}column = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
     told = summary(tmp_path, source, mapping)
     assert f"rpm on average{says}" in told
+
+
+def test_dates_in_a_column_beside_a_start_are_refused(tmp_path: Path) -> None:
+    _, x, v, a = signals(1000)
+    dates = np.datetime64("2026-01-31T12:00:00", "us") + 500 * np.arange(1000)
+    with pytest.raises(
+        MachineFileError, match=r"column t holds dates such as 2026-01-31T12:.*, expected no time.start"
+    ):
+        imported(tmp_path, archive(tmp_path, t=dates, x=x, v=v, a=a), TEXT)
+
+
+def test_a_packed_hdf5_column_without_a_scale_is_noted(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        for name, column in zip("xva", signals(1000)[1:], strict=True):
+            file[name] = column
+        file["x"].attrs.update({"units": "um", "scale_factor": 0.01})
+    told = summary(tmp_path, tmp_path / "run.h5", SAMPLED + CHANNELS)
+    assert "note: column x: the file says 'um after scale_factor', channel y1 takes its numbers as um" in told
+    scaled = CHANNELS.replace('"um"', '"um", scale = 0.01')
+    assert "note: column" not in summary(tmp_path, tmp_path / "run.h5", SAMPLED + scaled)

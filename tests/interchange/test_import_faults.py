@@ -112,6 +112,7 @@ def test_day_numbers_of_matlab_and_spreadsheets_are_times(tmp_path: Path, start:
             "row 1, column 't': found '2026-01-31T12:00:00.000000', expected a number", 'time.unit = "datetime"',
         )),
         *((good_rows(count), TEXT, HEADER, (f"run.csv: has {count} rows, expected at least two",)) for count in (0, 1)),
+        (["0,1,2,3", "1,1,2,3", "11,1,2,3"], TEXT, HEADER, ("run.csv: has 1 samples per second, the",)),
         (GOOD, TEXT.replace(f'start = "{START}"', ""), HEADER, ("give time.start in the mapping",)),
         *((GOOD, TEXT.replace(START, f"{year}-01-01T00:00:00Z"), HEADER, (
             f"run.csv: the first row is of about the year {year}, expected 1970 to 2261",
@@ -123,7 +124,7 @@ def test_day_numbers_of_matlab_and_spreadsheets_are_times(tmp_path: Path, start:
         *("last line", "same name", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
         *("other rate", "rate contradicts times", "five decimals", "days first", "dates"),
-        *("no row", "one row", "no start", "1900", "2300", "9999"),
+        *("no row", "one row", "uneven", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
 def test_mistakes_in_a_table_are_named(
@@ -164,6 +165,11 @@ def test_a_truncated_wav_file_is_refused_with_its_sample_counts(tmp_path: Path, 
     (tmp_path / "run.wav").write_bytes(whole[: -400 * samples[0].nbytes])
     said = "is truncated: 600 samples of each channel are there, expected the 1000"
     with pytest.raises(MachineFileError, match=said):
+        imported(tmp_path, tmp_path / "run.wav", mapping)
+    # Its writer was killed before it knew the length.
+    size_at = whole.index(b"data") + 4
+    (tmp_path / "run.wav").write_bytes(whole[:size_at] + bytes(4) + whole[size_at + 4 :])
+    with pytest.raises(MachineFileError, match="was not finished: its header says 0 samples, but 1000 of each channel"):
         imported(tmp_path, tmp_path / "run.wav", mapping)
 
 
@@ -231,6 +237,21 @@ def test_a_header_in_another_encoding_is_refused_naming_the_setting(tmp_path: Pa
         imported(tmp_path, source, TEXT)
     done, _ = imported(tmp_path, source, '[csv]\nencoding = "latin-1"\n' + TEXT)
     assert done.written.samples == 1000
+
+
+def test_bytes_that_are_no_text_are_not_sent_to_the_terminal(tmp_path: Path) -> None:
+    rows = [*GOOD[:5], "\x1b[2J\x07", *GOOD[5:]]
+    assert "row 6: Expected 4 columns, got 1: \N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER};" in fault(
+        tmp_path, rows, TEXT
+    )
+
+
+def test_a_table_in_utf_16_is_named(tmp_path: Path) -> None:
+    source = table(tmp_path / "run.csv", GOOD)
+    source.write_text(source.read_text(encoding="utf-8"), encoding="utf-16")
+    with pytest.raises(MachineFileError, match=r"run\.csv: is in UTF-16; write encoding = \"utf-16\" in \[csv\]"):
+        imported(tmp_path, source, TEXT)
+    assert imported(tmp_path, source, f'[csv]\nencoding = "utf-16"\n{TEXT}')[0].written.samples == 1000
 
 
 def test_a_decimal_point_among_decimal_commas_is_named_with_its_cell(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import re
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from models.commissioning.commissioned import install
+from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import read_recording
@@ -22,6 +25,7 @@ from service.interchange.importing import summary_lines
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from tests.interchange.material import (
+    CHANNELS,
     PULSES,
     SPEED_HZ,
     START,
@@ -207,3 +211,24 @@ def test_only_what_filters_derive_from_missing_numbers_is_missing(tmp_path: Path
     settling = lost[:, 1] & (np.arange(len(lost)) > 20_000)
     assert settling.sum() / 2000 == pytest.approx(6.0, abs=0.25)
     np.testing.assert_allclose(samples[~lost], whole[~lost], atol=0.02)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
+def test_samples_that_an_mf4_file_marks_as_invalid_are_missing(tmp_path: Path) -> None:
+    import asammdf  # noqa: PLC0415  # it takes seconds, and every worker reads this module
+
+    described, path = machine(), tmp_path / "run.mf4"
+    time, *columns = signals(4000)
+    invalid = (time >= 0.5) & (time < 1.0)
+    signal = partial(asammdf.Signal, timestamps=time)
+    with asammdf.MDF() as file:
+        file.start_time = datetime(2026, 1, 31, 12, tzinfo=UTC)
+        file.append([signal(columns[0], name="x", invalidation_bits=invalid)])
+        file.append([signal(columns[1], name="v"), signal(columns[2], name="a")])
+        file.save(path)
+    with pytest.raises(MachineFileError, match="row 1001, column x: found nan, expected a finite number"):
+        imported(tmp_path, path, CHANNELS, described)
+    _, recording = imported(tmp_path, path, f"{MISSING}\n{CHANNELS}", described)
+    found = samples_of(recording, described)
+    np.testing.assert_array_equal(found[:, 0], np.where(invalid, np.nan, columns[0]))
+    np.testing.assert_array_equal(found[:, 1:], np.column_stack(columns[1:]))
