@@ -26,6 +26,9 @@ from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault
 
 _MOST_MISFIT_Z = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
+_FAULTS_WITHOUT_SIGNAL = {FaultKind.MISSING, FaultKind.STUCK}
+"""Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
+
 Newest = tuple[SlidingWindow, SequentialTest]
 """The sliding window whose latest window is evaluated, and the sequential test that asks for shorter stretches."""
 
@@ -127,6 +130,9 @@ class WindowEvaluator(ABC):
     takes_short: bool = False
     """Whether stretches shorter than the window can be evaluated."""
 
+    takes_dead: bool = False
+    """Whether windows can be evaluated without sensors that have no signal."""
+
     directed: bool = True
     """Whether the directions of vectors mean anything: the shaft angle has not jumped since the monitor was set up, and
     no window has contradicted an angle of the heavy spot that was assumed because the machine file gives none."""
@@ -150,9 +156,15 @@ class WindowEvaluator(ABC):
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
         """Sensors to leave out so that a window can be evaluated despite these faults; None if it cannot be.
 
-        Faults of channels outside the equations do not matter, unless the machine has no equations.
+        Faults of channels outside the equations do not matter, unless the machine has no equations. Sensors without a
+        signal are left out while most are left (`takes_dead`), but not if the speed is found in the vibration: the
+        strength of its line depends on which sensors are left.
         """
-        return () if not findings or (plan.states and implicated(findings).issubset(plan.others)) else None
+        own = [one for one in findings if not plan.states or not set(one.states).issubset(plan.others)]
+        lost, dead = implicated(own), all(one.kind in _FAULTS_WITHOUT_SIGNAL for one in own)
+        most = self.takes_dead and plan.angle_column is not None and "theta" not in lost
+        enough = most and dead and len(plan.states_without(lost)) > len(plan.states) / 2
+        return tuple(sorted(lost)) if not own or enough else None
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Take note of sensor faults: once the shaft angle has jumped, directions mean nothing any more."""

@@ -81,12 +81,14 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
-        self.takes_short = self._baselines != ()
+        self.takes_short = self.takes_dead = self._baselines != ()
         self._drifted = np.zeros((len(PARAMETERS), len(PARAMETERS)))
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
         """Also despite gains that have drifted a little: `heard` widens the readings by them."""
-        return super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
+        lost = super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
+        left = plan.states_without(lost or ())
+        return lost if not lost or any(one.reads(left) for _, one in self._baselines) else None
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Also take note of gains that have drifted.
@@ -115,12 +117,13 @@ class BaselineEvaluator(WindowEvaluator):
             if unfit and self._operation is not None and (lost := self._rotation.lost(window, self._operation)):
                 raise EstimationError(f"{self._place}: {lost}")
             if newest is not None:
-                deciding, short = self._newest(*newest, deciding, latest)
-                deciding = self._with_latest_misfit(*newest, deciding, latest)
+                deciding, short = self._newest(*newest, deciding, latest, window.lost)
+                deciding = self._with_latest_misfit(*newest, deciding, latest, window.lost)
         else:
             nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
-        shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
+        alike = None if deciding.evaluable or window.lost else self._shape
+        shapes = () if alike is None else alike.judge(window, self._shape_rate)
         return Evaluation(deciding, short, _row_readings(deciding, window), (), speed, shapes, alone=not short)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -137,7 +140,7 @@ class BaselineEvaluator(WindowEvaluator):
         return with_shared_error(read, self._drifted) if self._drifted.any() else read
 
     def _newest(
-        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
+        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int, lost: tuple[str, ...]
     ) -> tuple[Diagnosis, dict[int, Diagnosis]]:
         """Diagnoses of the window and, if it may straddle a change, of its newest hops by their number, up to `latest`.
 
@@ -157,7 +160,7 @@ class BaselineEvaluator(WindowEvaluator):
             return deciding, found
         for hops in filter(latest.__ge__, test.wanted()):
             with suppress(EstimationError):  # too little data for itself, or outside the commissioned conditions
-                if (statistics := sliding.statistics(hops, lagged=True)) is not None:
+                if (statistics := sliding.statistics(hops, lagged=True, lost=lost)) is not None:
                     read = self._diagnose(statistics)
                     most = min(_MOST_MISFIT_Z, misfit_z * (hops / whole) ** 0.5 - _LESS) if outside else _MOST_MISFIT_Z
                     if not read.unexplained and (read.misfit_z or 0.0) < most:
@@ -167,7 +170,7 @@ class BaselineEvaluator(WindowEvaluator):
         return deciding, found
 
     def _with_latest_misfit(
-        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int
+        self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int, lost: tuple[str, ...]
     ) -> Diagnosis:
         """The window's diagnosis, with the misfit of its latest hops if an unbalance is named and theirs is larger.
 
@@ -181,7 +184,7 @@ class BaselineEvaluator(WindowEvaluator):
         if not due or "e" not in names or latest < hops:
             return deciding
         with suppress(EstimationError):
-            if (statistics := sliding.statistics(hops, lagged=True)) is not None:
+            if (statistics := sliding.statistics(hops, lagged=True, lost=lost)) is not None:
                 misfit_z = misfit_beside(stretch_of(self._diagnose(statistics), 0, 1), names)
                 return replace(deciding, misfit_z=max(misfit_z, deciding.misfit_z or 0.0))
         return deciding

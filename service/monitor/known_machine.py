@@ -1,6 +1,6 @@
 """Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,18 +15,16 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading, reversed_signs
-from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window.moments import STEADY, Plan
+from models.diagnosis.window.moments import STEADY
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
-from rotorwatch.records.sensor_faults import FaultKind
-from rotorwatch.records.windows import Equation, Opinion, SensorFault
+from rotorwatch.records.windows import Equation, Opinion
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, opinion_of, settled
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
@@ -41,8 +39,6 @@ better than another, and assigned at least to a window that is outside the model
 _MOST_UNBALANCE_RATIO, _LEAST_STANDARD_ERRORS = 20.0, 3.0
 """Largest credible multiple of the machine file's unbalance, and by how many standard errors it must be exceeded: a
 lost blade makes ten times the unbalance, millimetres in place of micrometres a thousand times."""
-_FAULTS_WITHOUT_SIGNAL = {FaultKind.MISSING, FaultKind.STUCK}
-"""Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
 _LEAST_MISFIT_TO_SPLIT = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested on their own."""
 
@@ -56,6 +52,7 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     by = "likelihood"
     takes_short = True
+    takes_dead = True
 
     def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
         identified = None if commissioned is None else commissioned.identified
@@ -85,19 +82,6 @@ class KnownMachineEvaluator(WindowEvaluator):
             others.append(NetworkDiagnostician(machine, bundle.amortised))
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
-
-    def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
-        """Also leave out sensors without a signal while most are left, as the theory holds for any set of sensors.
-
-        Not if the speed is found in the vibration: the strength of its line depends on which sensors are left.
-        """
-        none = super().spared(plan, findings)
-        own = [one for one in findings if not set(one.states).issubset(plan.others)]
-        if none is not None or plan.angle_column is None or any(one.kind not in _FAULTS_WITHOUT_SIGNAL for one in own):
-            return none
-        lost = implicated(own)
-        enough = "theta" not in lost and len(plan.states_without(lost)) > len(plan.states) / 2
-        return tuple(sorted(lost)) if enough else None
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""

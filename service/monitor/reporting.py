@@ -7,7 +7,7 @@ import numpy as np
 
 from models.alarm_names import SHAPE
 from models.commissioning.commissioned import Installed
-from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.check import dead_sensors, sensor_findings
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.sensors.standstill import Standstill
 from models.diagnosis.verdict.calibration import detectable_changes
@@ -77,10 +77,11 @@ class WindowReporter:
         there = statistics or samples.statistics(len(samples.hops))  # while it fills
         stood = "" if there is None else self.standstill.found(there)
         if statistics is None:
-            if missing and there is not None:  # no alarm clears here: other faults are looked for in full windows
-                self._data_path.sensors(missing, there, standing=True)
-            levels.tell(self._alarms, end_ns, faulty=implicated(missing), standing=bool(stood))
-            return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=missing)
+            dead = missing if there is None else dead_sensors(there, self._machine.sensors, missing)
+            if dead and there is not None:  # no alarm clears here: other faults are looked for in full windows
+                self._data_path.sensors(dead, there, standing=True)
+            levels.tell(self._alarms, end_ns, faulty=implicated(dead), standing=bool(stood))
+            return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=dead)
         findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
         if not stood and "theta" not in implicated(findings):
             findings += levels.rewired()

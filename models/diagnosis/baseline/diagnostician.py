@@ -6,7 +6,7 @@ with a single sensor, or several on one transducer, the common factor is the onl
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -137,6 +137,10 @@ class BaselineDiagnostician:
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
                 self._coefficients[at] = relation.coefficients
+
+    def reads(self, states: Collection[str]) -> bool:
+        """Whether a relation can be read if these states are measured."""
+        return any(one is not None and set(one.states).issubset(states) for one in self._baseline.relations)
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: a parameter that cannot be read carries the reason."""

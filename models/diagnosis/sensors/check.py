@@ -20,6 +20,15 @@ from rotorwatch.records.windows import SensorFault
 _ALL = 0.999  # part of a window from which on its shaft angle counts as missing throughout
 
 
+def dead_sensors(
+    window: WindowStatistics, channels: Iterable[Channel], missing: Sequence[SensorFault]
+) -> tuple[SensorFault, ...]:
+    """Vibration channels that are `missing` or stuck, in a window of any length."""
+    known = {"theta", *implicated(missing)}
+    found = stuck(window.as_mounted, Naming(channels), np.full(len(window.waveforms), True))
+    return (*missing, *(one for one in found if known.isdisjoint(one.states)))
+
+
 def sensor_findings(
     window: WindowStatistics,
     reference: SensorReference | None = None,

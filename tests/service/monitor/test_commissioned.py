@@ -115,6 +115,23 @@ def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
     assert not any(window.parameters for window in full(windows))
 
 
+def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
+    """The relation that was learned with the dead sensor is not read; the other still holds."""
+    ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
+    dead = np.where([sensor.name == "y1" for sensor in MACHINE.sensors], np.nan, 1.0)
+    windows, events = feed(MachineMonitor(installed()), with_samples(ran, samples_of(ran) * dead))
+    raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
+    assert raised == {"data-missing", "k_bz"}
+    last = full(windows)[-1]
+    assert last.state is HealthState.ALERT
+    assert last.sensors[0].text.endswith("the machine is diagnosed without it")
+    readings = {one.name: one for one in last.parameters}
+    assert readings["k_by"].relative_change is None
+    assert "y1" in readings["k_by"].reason
+    assert abs(sure(readings["k_bz"].relative_change) + 0.35) < 3 * sure(readings["k_bz"].standard_error) < 0.2
+    assert readings["e"].relative_change is not None
+
+
 def test_a_change_within_the_window_is_named_and_not_outside_the_model() -> None:
     """Windows across the change fit neither state of the machine; their latest data fit."""
     begins_s = 63.0
