@@ -255,7 +255,7 @@ def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) ->
 def _lowest(fields: dict[str, float], axis: str) -> float:
     """Lowest natural frequency in a plane, rad/s, at rest."""
     damping = {f"c_b{each}_N_s_per_m": fields.get(f"c_b{each}_N_s_per_m", 1.0) for each in "yz"}
-    rotor = RotorParameters.model_validate({"e_m": 0.0, **fields, **damping})
+    rotor = RotorParameters.model_validate({"e_m": 1e-6, **fields, **damping})
     at = slice(0, 3) if axis == "y" else slice(3, 6)
     squares = np.linalg.eigvals(np.linalg.solve(M_matrix(rotor)[at, at], Q_matrix(rotor)[at, at]))
     return float(np.sqrt(np.min(squares.real)))
