@@ -37,7 +37,7 @@ _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
 # Differences matter above this part of the limit of the parameter's alarm. Sensors are calibrated to some per cent, but
 # with one force standard errors are less than a thousandth, so smaller differences can be significant.
-_MATTERS = 1 / 3
+MATTERS = 1 / 3
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
@@ -331,10 +331,9 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
         for reading in each.evaluable
         if reading.name in one.changed
     ]
-    named = Counter(name for name, by in differ if abs(by) > _MATTERS * machine.alarms.for_parameter(name).raise_above)
+    named = Counter(name for name, by in differ if abs(by) > MATTERS * machine.alarms.for_parameter(name).raise_above)
     outside = sum(one.outside for one in isolations)
-    suspect = Counter(each.suspect.partition(" (")[0] for each in readable if each.suspect).most_common(1)
-    why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
+    why = _best_explanation(machine, readable)
     if named:
         worst = named.most_common(1)[0][0]
         readings = [reading for each in readable for reading in each.evaluable if reading.name == worst]
@@ -357,7 +356,8 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
             name=name,
             verdict="refused" if what is not None and other else "limited",
             text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}{why}",
-            advice="give fewer parameters in [rotor], so that more is learned from the recordings",
+            advice=f"check {'what explains it best, and ' if why else ''}masses and dimensions in [rotor], or give "
+            "fewer parameters there, so that more is learned from the recordings",
         )
     if differ:
         worst, by = max(differ, key=lambda one: abs(one[1]))
@@ -366,6 +366,21 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
     text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
+
+
+def _best_explanation(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> str:
+    """The most frequent suspect, of its median size and in the names of the channels; empty without any."""
+    suspects: list[tuple[str, float, str]] = []
+    for each in diagnoses:
+        if each.suspect:
+            tried = () if each.goodness is None else each.goodness.alternatives
+            best = max(tried, key=lambda one: abs(one.z), default=None)
+            cause = each.suspect.partition(" (")[0]
+            suspects.append((cause, 0.0 if best is None else best.change, each.suspect))
+    for cause, count in Counter(one for one, _, _ in suspects).most_common(1):
+        _, _, median = sorted(one for one in suspects if one[0] == cause)[count // 2]
+        return f"; best explained by: {with_channel_names(median, machine.sensors)}, in {count} of them"
+    return ""
 
 
 def _is_little(diagnosis: Diagnosis) -> bool:

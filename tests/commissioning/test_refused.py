@@ -330,18 +330,25 @@ def test_agreement_of_the_unbalance_is_judged_by_its_vector(turned_rad: float, v
 
 
 @pytest.mark.parametrize(
-    ("tried", "change", "verdict"),
+    ("tried", "change", "verdict", "told"),
     [
-        ("share of z1 in y1", 0.02, "limited"), ("share of z1 in y1", 0.06, "refused"),
-        ("delay of y1", 4e-5, "limited"), ("delay of y1", 3e-4, "refused"), ("mass of the disc", 0.02, "refused"),
+        ("share of z1 in y1", 0.02, "limited", "share of z1 in XE-1 (+2.0%)"),
+        ("share of z1 in y1", 0.06, "refused", "share of z1 in XE-1 (+6.0%)"),
+        ("delay of y1", 4e-5, "limited", "delay of XE-1 (+40 µs)"),
+        ("delay of y1", 3e-4, "refused", "delay of XE-1 (+300 µs)"),
+        ("mass of the disc", 0.02, "refused", "mass of the disc (+2.0%)"),
     ],
-)  # fmt: skip
+)
 def test_a_slightly_turned_or_late_sensor_does_not_refuse_the_machine_file(
-    tried: str, change: float, verdict: str
+    tried: str, change: float, verdict: str, told: str
 ) -> None:
+    """The check says by how much, and of which channel: what to enter in the machine file follows from it."""
+    y1, *others = LAB.sensors
+    machine = LAB.model_copy(update={"sensors": (y1.model_copy(update={"name": "XE-1"}), *others)})
     read = (parameter_reading("k_by", "likelihood", 0.0, 3e-4),)
-    goodness = Goodness(3.0, (AlternativeTest(tried, 12.0, change),), 2)
-    one = Diagnosis("likelihood", read, misfit_z=goodness.misfit_z, goodness=goodness, suspect=goodness.suspect)
-    check = check_agreement(LAB, [one] * 6, "the parameters in the file")
+    sizes = [Goodness(3.0, (AlternativeTest(tried, 12.0, one * change),), 2) for one in (0.9, 1.2, 1.0, 0.8, 1.1)]
+    windows = [Diagnosis("likelihood", read, misfit_z=one.misfit_z, goodness=one, suspect=one.suspect) for one in sizes]
+    check = check_agreement(machine, windows, "the parameters in the file")
     assert check.verdict == verdict
-    assert check.text.endswith(f"; best explained by: {tried}, in 6 of them")
+    assert check.text.endswith(f"; best explained by: {told}, in 5 of them")
+    assert check.advice.startswith("check what explains it best, and masses")
