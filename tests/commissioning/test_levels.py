@@ -43,6 +43,7 @@ from tests.commissioning.rotor_kit import (
     recording,
     samples_of,
     stream,
+    told_of,
     windows_of,
     with_lines,
     with_samples,
@@ -116,6 +117,18 @@ def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
     assert {round(line_hz) for line_hz, _ in found.lines} == {37, 44, 50}
     assert_identified(made, PARAMETERS[:4])
     assert Commissioned.model_validate_json(found.model_dump_json()) == found
+
+
+def test_values_of_an_incomplete_file_that_the_recordings_contradict_are_reported() -> None:
+    """They are only a first guess: the identified ones are used, but a wrong mass may be the cause."""
+    given = {"k_by_N_per_m": 1.25 * LAB.rotor.k_by_N_per_m, "k_bz_N_per_m": LAB.rotor.k_bz_N_per_m}
+    machine = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=given)})
+    made = commissioned(machine, healthy(PARTIAL, 70.0, 41))
+    assert_identified(made, PARAMETERS[:4])
+    verdict, text, advice = told_of(made, "values in the machine file")
+    assert verdict == made.report.verdict == "limited"
+    assert text.endswith("used as identified: bearing stiffness, horizontal (k_by) -19%")
+    assert "leave out" in advice
 
 
 @pytest.mark.parametrize("machine", [blind(LAB, 1.5), pytest.param(blind(PARTIAL), marks=pytest.mark.long)])
