@@ -137,6 +137,27 @@ def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics])
     )
 
 
+def check_speed_range(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
+    """Refusal if no later window at the recorded speeds would be evaluated, a limit if some would not; else None."""
+    operation = machine.operation
+    rpm = [abs(window.speed_rad_s) * 30 / np.pi for window in windows if np.isfinite(window.speed_rad_s)]
+    if operation is None or not rpm:
+        return None
+    outside = [one for one in rpm if abs(one / operation.speed_rpm - 1) > operation.speed_tolerance]
+    if not outside:
+        return None
+    seen = " to ".join(dict.fromkeys(f"{one:.0f}" for one in (min(outside), max(outside))))
+    slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
+    return Check(
+        name="speed range",
+        verdict="refused" if len(outside) == len(rpm) else "limited",
+        text=f"the machine turned at {seen} rpm, and is evaluated from {slowest:.0f} to {fastest:.0f} rpm alone: "
+        "speed_rpm ± speed_tolerance of the machine file",
+        advice="correct speed_rpm in [operation] of the machine file, or give a larger speed_tolerance; the recordings "
+        "can stay",
+    )
+
+
 def check_steady(
     machine: MachineFile, recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]
 ) -> Check:

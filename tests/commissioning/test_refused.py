@@ -16,6 +16,7 @@ from models.commissioning.checks import (
     check_sensors_of,
     check_shapes,
     check_speed_given,
+    check_speed_range,
 )
 from models.commissioning.commission import Commissioning
 from models.commissioning.healthy import HealthyRecording
@@ -318,6 +319,29 @@ def test_a_fast_machine_must_have_its_speed_in_the_file(rpm: float, given: Opera
         assert found.text == "the shaft turns at 6600 rpm, and the windows are those of a slower machine"
         assert "give speed_rpm = 6600 in [operation]" in found.advice
     assert check_speed_given(LAB, windows) is None  # its natural frequencies are known
+
+
+@pytest.mark.parametrize(
+    ("speeds_rpm", "verdict"), [((1250, 1500), None), ((800, 1320), "limited"), ((800, 810), "refused")]
+)
+def test_speeds_at_which_a_known_machine_is_not_evaluated_are_reported(
+    speeds_rpm: Sequence[float], verdict: str | None
+) -> None:
+    first = healthy_windows()[0]
+    check = check_speed_range(LAB, [replace(first, speed_rad_s=rpm * np.pi / 30) for rpm in speeds_rpm])
+    assert (check.verdict if check else None) == verdict
+    if check:
+        assert re.search("turned at 800.* evaluated from 1056 to 1584 rpm alone", check.text)
+
+
+def test_a_speed_beyond_that_of_the_file_is_refused_because_nothing_would_be_evaluated() -> None:
+    wrong = PARTIAL.model_copy(update={"operation": Operation(speed_rpm=1000.0)})
+    made = made_of(stream(HEALTHY_S, 52), wrong)
+    assert made.commissioned is None
+    verdict, text, advice = told_of(made, "speed range")
+    assert verdict == "refused"
+    assert "turned at 1320 rpm, and is evaluated from 800 to 1200 rpm alone" in text
+    assert advice.startswith("correct speed_rpm")
 
 
 @pytest.mark.parametrize(("turned_rad", "verdict"), [(0.02, "passed"), (0.2, "refused")])
