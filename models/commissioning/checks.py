@@ -37,7 +37,7 @@ _MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it
 _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
 # Differences matter above this part of the limit of the parameter's alarm. Sensors are calibrated to some per cent, but
 # with one force standard errors are less than a thousandth, so smaller differences can be significant.
-_MATTERS = 1 / 3
+MATTERS = 1 / 3
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
@@ -134,6 +134,27 @@ def check_speed_given(machine: MachineFile, windows: Sequence[WindowStatistics])
         text=f"the shaft turns at {60 * fastest_hz:.0f} rpm, and the windows are those of a slower machine",
         advice=f"give speed_rpm = {60 * fastest_hz:.0f} in [operation] of the machine file, and where its speed varies "
         "speed_tolerance: what [window] leaves out follows from it; the recordings can stay",
+    )
+
+
+def check_speed_range(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Check | None:
+    """Refusal if no later window at the recorded speeds would be evaluated, a limit if some would not; else None."""
+    operation = machine.operation
+    rpm = [abs(window.speed_rad_s) * 30 / np.pi for window in windows if np.isfinite(window.speed_rad_s)]
+    if operation is None or not rpm:
+        return None
+    outside = [one for one in rpm if abs(one / operation.speed_rpm - 1) > operation.speed_tolerance]
+    if not outside:
+        return None
+    seen = " to ".join(dict.fromkeys(f"{one:.0f}" for one in (min(outside), max(outside))))
+    slowest, fastest = (operation.speed_rpm * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
+    return Check(
+        name="speed range",
+        verdict="refused" if len(outside) == len(rpm) else "limited",
+        text=f"the machine turned at {seen} rpm, and is evaluated from {slowest:.0f} to {fastest:.0f} rpm alone: "
+        "speed_rpm ± speed_tolerance of the machine file",
+        advice="correct speed_rpm in [operation] of the machine file, or give a larger speed_tolerance; the recordings "
+        "can stay",
     )
 
 
@@ -331,10 +352,9 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
         for reading in each.evaluable
         if reading.name in one.changed
     ]
-    named = Counter(name for name, by in differ if abs(by) > _MATTERS * machine.alarms.for_parameter(name).raise_above)
+    named = Counter(name for name, by in differ if abs(by) > MATTERS * machine.alarms.for_parameter(name).raise_above)
     outside = sum(one.outside for one in isolations)
-    suspect = Counter(each.suspect.partition(" (")[0] for each in readable if each.suspect).most_common(1)
-    why = "".join(f"; best explained by: {one}, in {count} of them" for one, count in suspect)
+    why = _best_explanation(machine, readable)
     if named:
         worst = named.most_common(1)[0][0]
         readings = [reading for each in readable for reading in each.evaluable if reading.name == worst]
@@ -357,7 +377,8 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
             name=name,
             verdict="refused" if what is not None and other else "limited",
             text=f"{outside} of {len(readable)} windows differ by more than chance explains, {between}{why}",
-            advice="give fewer parameters in [rotor], so that more is learned from the recordings",
+            advice=f"check {'what explains it best, and ' if why else ''}masses and dimensions in [rotor], or give "
+            "fewer parameters there, so that more is learned from the recordings",
         )
     if differ:
         worst, by = max(differ, key=lambda one: abs(one[1]))
@@ -366,6 +387,21 @@ def check_agreement(machine: MachineFile, diagnoses: Sequence[Diagnosis], what: 
     worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
     text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
     return Check(name=name, verdict="passed", text=text)
+
+
+def _best_explanation(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> str:
+    """The most frequent suspect, of its median size and in the names of the channels; empty without any."""
+    suspects: list[tuple[str, float, str]] = []
+    for each in diagnoses:
+        if each.suspect:
+            tried = () if each.goodness is None else each.goodness.alternatives
+            best = max(tried, key=lambda one: abs(one.z), default=None)
+            cause = each.suspect.partition(" (")[0]
+            suspects.append((cause, 0.0 if best is None else best.change, each.suspect))
+    for cause, count in Counter(one for one, _, _ in suspects).most_common(1):
+        _, _, median = sorted(one for one in suspects if one[0] == cause)[count // 2]
+        return f"; best explained by: {with_channel_names(median, machine.sensors)}, in {count} of them"
+    return ""
 
 
 def _is_little(diagnosis: Diagnosis) -> bool:

@@ -15,6 +15,7 @@ from models.commissioning.checks import (
     check_lines,
     check_sensors_of,
     check_speed_given,
+    check_speed_range,
     check_steady,
 )
 from models.commissioning.commissioned import (
@@ -259,6 +260,9 @@ def commission(
             checks.append(_only_levels(machine, knowledge.text))
         else:
             checks += [check_steady(machine, recordings, by_recording), check_lines(machine, recordings)]
+            in_range = check_speed_range(machine, [piece.window for piece in pieces])
+            if in_range is not None and knowledge.level is not KnowledgeLevel.NONE:
+                checks.append(in_range)
         if states and all(check.verdict != "refused" for check in checks):
             try:
                 learned = learn(knowledge.level, machine, pieces, progress)

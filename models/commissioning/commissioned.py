@@ -88,7 +88,7 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
         )
     elif rotor.unknown:
         level, names = KnowledgeLevel.PARTIAL, ", ".join(rotor.unknown)
-        text = f"[rotor] gives masses and shaft; what it lacks is identified from the recordings: {names}"
+        text = f"[rotor] gives masses and shaft; stiffness, damping and unbalance are identified, as it lacks {names}"
     else:
         tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
         level = KnowledgeLevel.PARTIAL

@@ -28,7 +28,7 @@ _ROUNDS = 8
 _SETTLED = 0.02  # largest relative move of a parameter in the last round
 _ONE_SIZE = 0.1  # largest relative deviation of an unbalance's size that may come from another speed or load
 _MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
-_START_DAMPING = 0.05
+_START_DAMPING = (0.05, 0.2)  # the second one where the first is too far off for any window to be read
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
 _NO_STIFFNESS = 1e5  # N/m, placeholder in a plane without any sensor, whose stiffness is never read
@@ -67,8 +67,14 @@ def identify(
     MachineFileError
         If masses or shaft are missing.
     """
-    whole = in_sense(_first_guess(machine, windows), sense)
-    diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
+    for damping in _START_DAMPING:
+        whole = in_sense(_first_guess(machine, windows, damping), sense)
+        try:
+            diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
+            break
+        except EstimationError:
+            if damping == _START_DAMPING[-1]:
+                raise
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
         values, covariance = together.estimate
@@ -182,7 +188,7 @@ def _moved(
     return balanced, [fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in pairs]
 
 
-def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:
+def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], damping: float) -> Machine:
     """First guess of every parameter: from the file, the relation of bearing and disc, or the strongest peak."""
     known = machine.rotor
     if known is None or known.m2_kg is None or known.m1_kg is None:
@@ -202,7 +208,7 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> M
     fields = {**guesses, **given}
     for axis in "yz":
         k = fields[f"k_b{axis}_N_per_m"]
-        fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * _START_DAMPING * math.sqrt(k * (known.m1_kg + known.m2_kg)))
+        fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * damping * math.sqrt(k * (known.m1_kg + known.m2_kg)))
     low_hz, high_hz = (edge / machine.time_scale for edge in _CUTOFF_HZ)
     condition = machine.condition or ConditionRange(cutoff_hz=(low_hz, high_hz))
     tables = {"rotor": RotorParameters.model_validate(fields), "operation": operation, "condition": condition}
@@ -255,7 +261,7 @@ def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) ->
 def _lowest(fields: dict[str, float], axis: str) -> float:
     """Lowest natural frequency in a plane, rad/s, at rest."""
     damping = {f"c_b{each}_N_s_per_m": fields.get(f"c_b{each}_N_s_per_m", 1.0) for each in "yz"}
-    rotor = RotorParameters.model_validate({"e_m": 0.0, **fields, **damping})
+    rotor = RotorParameters.model_validate({"e_m": 1e-6, **fields, **damping})
     at = slice(0, 3) if axis == "y" else slice(3, 6)
     squares = np.linalg.eigvals(np.linalg.solve(M_matrix(rotor)[at, at], Q_matrix(rotor)[at, at]))
     return float(np.sqrt(np.min(squares.real)))

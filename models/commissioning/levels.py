@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 
 from models.commissioning.checks import (
+    MATTERS,
     SAME_SPEED,
     Check,
     check_agreement,
@@ -49,6 +50,7 @@ from models.diagnosis.window.statistics import WindowStatistics, levels_of, wind
 from models.errors import EstimationError
 from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile
+from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 from models.signals.channels import ACCELERATIONS
 
 Read = tuple[str, int, Diagnosis]  # recording, end of the window in ns, and its diagnosis
@@ -58,6 +60,7 @@ _OPPOSITE = (
     "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
+_NO_CHANCE = 3.0  # standard errors beyond which an identified value is not the file's
 _SHORTEST_HOPS = 4  # with fewer hops, their scatter is too uncertain
 
 
@@ -344,7 +347,29 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
     best = min(found, key=_doubt, default=None)  # the first sense if both are equally good
     if best is None or (best.gyroscopic == "opposite" and _doubt(best) == _REFUSED):
         raise errors[0]
+    if level is KnowledgeLevel.PARTIAL:
+        best = replace(best, checks=(*best.checks, *_not_as_given(machine, best)))
     return best if best.gyroscopic == "Eq. 27" else replace(best, notes=(*best.notes, _OPPOSITE))
+
+
+def _not_as_given(machine: MachineFile, learned: Learned) -> tuple[Check, ...]:
+    """Check that names what the file gives and the recordings contradict; empty without."""
+    record, told = learned.identified, []
+    if machine.rotor is None or learned.machine is None or record is None:
+        return ()
+    for name, variance in zip(PARAMETERS, np.diag(record.matrix()).tolist(), strict=True):
+        given, found = (getattr(rotor, FAULT_FIELDS[name]) for rotor in (machine.rotor, learned.machine.rotor))
+        by = 0.0 if given is None or name not in record.names else found / given - 1
+        if abs(by) > max(MATTERS * machine.alarms.for_parameter(name).raise_above, _NO_CHANCE * math.sqrt(variance)):
+            told.append(f"{PARAMETER_TEXT[name]} ({name}) {by:+.0%}")
+    if not told:
+        return ()
+    text = f"identified otherwise than the machine file gives, and used as identified: {', '.join(told)}"
+    advice = (
+        "correct these values in [rotor], or leave out those of the bearing and e_m; if you know them for certain, "
+        "masses or dimensions are not those of the machine: weigh and measure again"
+    )
+    return (Check(name="values in the machine file", verdict="limited", text=text, advice=advice),)
 
 
 _DOUBTS = ("passed", "limited", "refused")

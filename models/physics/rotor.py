@@ -25,7 +25,7 @@ class KnownRotor(BaseModel, extra="forbid", frozen=True):
     k_bz_N_per_m: float | None = Field(default=None, gt=0, le=1e12)
     c_by_N_s_per_m: float | None = Field(default=None, gt=0, le=1e9)
     c_bz_N_s_per_m: float | None = Field(default=None, gt=0, le=1e9)
-    e_m: float | None = Field(default=None, ge=0, le=0.1)
+    e_m: float | None = Field(default=None, gt=0, le=0.1)  # changes are relative to it
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ class RotorParameters(KnownRotor):
     k_bz_N_per_m: float = Field(gt=0, le=1e12, description="bearing stiffness, vertical")
     c_by_N_s_per_m: float = Field(gt=0, le=1e9, description="bearing damping, horizontal")
     c_bz_N_s_per_m: float = Field(gt=0, le=1e9, description="bearing damping, vertical")
-    e_m: float = Field(ge=0, le=0.1, description="eccentricity of the disc's centre of mass")
+    e_m: float = Field(gt=0, le=0.1, description="eccentricity of the disc's centre of mass")
 
     @property
     def EI_N_m2(self) -> float:

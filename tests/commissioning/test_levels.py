@@ -30,7 +30,8 @@ from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
 from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
@@ -43,6 +44,7 @@ from tests.commissioning.rotor_kit import (
     recording,
     samples_of,
     stream,
+    told_of,
     windows_of,
     with_lines,
     with_samples,
@@ -116,6 +118,31 @@ def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
     assert {round(line_hz) for line_hz, _ in found.lines} == {37, 44, 50}
     assert_identified(made, PARAMETERS[:4])
     assert Commissioned.model_validate_json(found.model_dump_json()) == found
+
+
+def test_a_damped_rotor_is_identified_with_sensors_at_its_bearing_alone() -> None:
+    """Without a relation of bearing and disc, the first guess of damping is an assumption, here far too low."""
+    damped = LAB.rotor.model_copy(update={"c_by_N_s_per_m": 160.0, "c_bz_N_s_per_m": 160.0})
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=70.0, seed=2_901_092, faults=())
+    shaken = tuple(block for block, _ in blocks(scenario, machine.model_copy(update={"rotor": damped})))
+    file, at_bearing = with_sensors(PARTIAL, shaken, lambda sensor: sensor.location != "disc")
+    made = commissioned(file, recording(file, at_bearing))
+    assert made.report.verdict == "limited"  # by its length alone
+    rotor = sure(made.machine).rotor
+    assert (rotor.c_by_N_s_per_m, rotor.c_bz_N_s_per_m) == pytest.approx((160.0, 160.0), rel=0.25)
+
+
+def test_values_of_an_incomplete_file_that_the_recordings_contradict_are_reported() -> None:
+    """They are only a first guess: the identified ones are used, but a wrong mass may be the cause."""
+    given = {"k_by_N_per_m": 1.25 * LAB.rotor.k_by_N_per_m, "k_bz_N_per_m": LAB.rotor.k_bz_N_per_m}
+    machine = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=given)})
+    made = commissioned(machine, healthy(PARTIAL, 70.0, 41))
+    assert_identified(made, PARAMETERS[:4])
+    verdict, text, advice = told_of(made, "values in the machine file")
+    assert verdict == made.report.verdict == "limited"
+    assert text.endswith("used as identified: bearing stiffness, horizontal (k_by) -19%")
+    assert "leave out" in advice
 
 
 @pytest.mark.parametrize("machine", [blind(LAB, 1.5), pytest.param(blind(PARTIAL), marks=pytest.mark.long)])

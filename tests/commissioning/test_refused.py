@@ -16,6 +16,7 @@ from models.commissioning.checks import (
     check_sensors_of,
     check_shapes,
     check_speed_given,
+    check_speed_range,
 )
 from models.commissioning.commission import Commissioning
 from models.commissioning.healthy import HealthyRecording
@@ -320,6 +321,29 @@ def test_a_fast_machine_must_have_its_speed_in_the_file(rpm: float, given: Opera
     assert check_speed_given(LAB, windows) is None  # its natural frequencies are known
 
 
+@pytest.mark.parametrize(
+    ("speeds_rpm", "verdict"), [((1250, 1500), None), ((800, 1320), "limited"), ((800, 810), "refused")]
+)
+def test_speeds_at_which_a_known_machine_is_not_evaluated_are_reported(
+    speeds_rpm: Sequence[float], verdict: str | None
+) -> None:
+    first = healthy_windows()[0]
+    check = check_speed_range(LAB, [replace(first, speed_rad_s=rpm * np.pi / 30) for rpm in speeds_rpm])
+    assert (check.verdict if check else None) == verdict
+    if check:
+        assert re.search("turned at 800.* evaluated from 1056 to 1584 rpm alone", check.text)
+
+
+def test_a_speed_beyond_that_of_the_file_is_refused_because_nothing_would_be_evaluated() -> None:
+    wrong = PARTIAL.model_copy(update={"operation": Operation(speed_rpm=1000.0)})
+    made = made_of(stream(HEALTHY_S, 52), wrong)
+    assert made.commissioned is None
+    verdict, text, advice = told_of(made, "speed range")
+    assert verdict == "refused"
+    assert "turned at 1320 rpm, and is evaluated from 800 to 1200 rpm alone" in text
+    assert advice.startswith("correct speed_rpm")
+
+
 @pytest.mark.parametrize(("turned_rad", "verdict"), [(0.02, "passed"), (0.2, "refused")])
 def test_agreement_of_the_unbalance_is_judged_by_its_vector(turned_rad: float, verdict: str) -> None:
     vector = UnbalanceVector(np.cos(turned_rad), np.sin(turned_rad), 1e-7, 0.0, 1e-7)
@@ -330,18 +354,25 @@ def test_agreement_of_the_unbalance_is_judged_by_its_vector(turned_rad: float, v
 
 
 @pytest.mark.parametrize(
-    ("tried", "change", "verdict"),
+    ("tried", "change", "verdict", "told"),
     [
-        ("share of z1 in y1", 0.02, "limited"), ("share of z1 in y1", 0.06, "refused"),
-        ("delay of y1", 4e-5, "limited"), ("delay of y1", 3e-4, "refused"), ("mass of the disc", 0.02, "refused"),
+        ("share of z1 in y1", 0.02, "limited", "share of z1 in XE-1 (+2.0%)"),
+        ("share of z1 in y1", 0.06, "refused", "share of z1 in XE-1 (+6.0%)"),
+        ("delay of y1", 4e-5, "limited", "delay of XE-1 (+40 µs)"),
+        ("delay of y1", 3e-4, "refused", "delay of XE-1 (+300 µs)"),
+        ("mass of the disc", 0.02, "refused", "mass of the disc (+2.0%)"),
     ],
-)  # fmt: skip
+)
 def test_a_slightly_turned_or_late_sensor_does_not_refuse_the_machine_file(
-    tried: str, change: float, verdict: str
+    tried: str, change: float, verdict: str, told: str
 ) -> None:
+    """The check says by how much, and of which channel: what to enter in the machine file follows from it."""
+    y1, *others = LAB.sensors
+    machine = LAB.model_copy(update={"sensors": (y1.model_copy(update={"name": "XE-1"}), *others)})
     read = (parameter_reading("k_by", "likelihood", 0.0, 3e-4),)
-    goodness = Goodness(3.0, (AlternativeTest(tried, 12.0, change),), 2)
-    one = Diagnosis("likelihood", read, misfit_z=goodness.misfit_z, goodness=goodness, suspect=goodness.suspect)
-    check = check_agreement(LAB, [one] * 6, "the parameters in the file")
+    sizes = [Goodness(3.0, (AlternativeTest(tried, 12.0, one * change),), 2) for one in (0.9, 1.2, 1.0, 0.8, 1.1)]
+    windows = [Diagnosis("likelihood", read, misfit_z=one.misfit_z, goodness=one, suspect=one.suspect) for one in sizes]
+    check = check_agreement(machine, windows, "the parameters in the file")
     assert check.verdict == verdict
-    assert check.text.endswith(f"; best explained by: {tried}, in 6 of them")
+    assert check.text.endswith(f"; best explained by: {told}, in 5 of them")
+    assert check.advice.startswith("check what explains it best, and masses")

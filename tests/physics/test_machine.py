@@ -169,6 +169,12 @@ def test_a_rotor_without_natural_frequencies_is_refused(tmp_path: Path) -> None:
         load_machine(write(tmp_path, text))
 
 
+def test_an_unbalance_of_zero_is_refused_because_changes_are_relative_to_it(tmp_path: Path) -> None:
+    path = write(tmp_path, LAB.replace("e_m = 20e-6", "e_m = 0.0"))
+    with pytest.raises(MachineFileError, match=r"rotor\.e_m: expected above 0 and at most 0\.1 \(found 0\.0\)"):
+        load_machine_file(path)
+
+
 def test_the_mean_is_no_part_of_the_band(tmp_path: Path) -> None:
     """Snapshots of a slow machine may be too short for segments that resolve its slowest motion."""
     machine = kit(tmp_path, 0.05, 200.0, "[schedule]", "on_s = 2.0", "every_s = 60.0")
