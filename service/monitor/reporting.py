@@ -77,11 +77,7 @@ class WindowReporter:
         there = statistics or samples.statistics(len(samples.hops))  # while it fills
         stood = "" if there is None else self.standstill.found(there)
         if statistics is None:
-            dead = missing if there is None else dead_sensors(there, self._machine.sensors, missing)
-            if dead and there is not None:  # no alarm clears here: other faults are looked for in full windows
-                self._data_path.sensors(dead, there, standing=True)
-            levels.tell(self._alarms, end_ns, faulty=implicated(dead), standing=bool(stood))
-            return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=dead)
+            return self._while_it_fills(end_ns, there, missing, standing=bool(stood))
         findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
         if not stood and "theta" not in implicated(findings):
             findings += levels.rewired()
@@ -143,6 +139,16 @@ class WindowReporter:
             reason=reason,
             shapes=evaluation.shapes,
         )
+
+    def _while_it_fills(
+        self, end_ns: int, there: WindowStatistics | None, missing: tuple[SensorFault, ...], *, standing: bool
+    ) -> Report:
+        """Report on the hops that are `there`: no alarm clears, as other faults are looked for in full windows."""
+        dead = missing if there is None else dead_sensors(there, self._machine.sensors, missing)
+        if dead and there is not None:
+            self._data_path.sensors(dead, there, standing=True)
+        self.levels.tell(self._alarms, end_ns, faulty=implicated(dead), standing=standing)
+        return self.unread(end_ns, end_ns, HealthState.WARMING, sensors=dead)
 
     def unread(self, start_ns: int, end_ns: int, calm: HealthState, **seen: Any) -> Report:
         """Report of the levels and the sensors alone."""
