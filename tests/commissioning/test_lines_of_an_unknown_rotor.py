@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from models.commissioning.commissioned import Commissioned
+from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
 from models.commissioning.levels import pieces_of
 from models.diagnosis.window.statistics import WindowStatistics, window_statistics
@@ -36,14 +37,17 @@ def recorded(*, lines: bool) -> Sequence[SampleBlock]:
 
 
 @cache
+def read(*, lines: bool) -> HealthyRecording:
+    return recording(NOTHING, recorded(lines=lines))
+
+
 def healthy(*, lines: bool) -> tuple[WindowStatistics, ...]:
-    pieces = pieces_of([recording(NOTHING, recorded(lines=lines))])
-    return tuple(piece.window for piece in pieces)
+    return tuple(piece.window for piece in pieces_of([read(lines=lines)]))
 
 
 @cache
 def made(*, lines: bool) -> Commissioned:
-    return sure(commissioned(NOTHING, recording(NOTHING, recorded(lines=lines))).commissioned)
+    return sure(commissioned(NOTHING, read(lines=lines)).commissioned)
 
 
 def test_lines_are_removed_from_correlations_at_all_lags_exactly_once() -> None:
@@ -68,7 +72,7 @@ def test_relations_learned_with_lines_agree_with_those_learned_without() -> None
 
 
 def test_windows_are_read_without_lines_if_relations_were_learned_without_them() -> None:
-    hops = recording(NOTHING, recorded(lines=True))
+    hops = read(lines=True)
     window = window_statistics(hops.plan, hops.hops[: hops.plan.hops], lines=made(lines=True).lines)
     before = made(lines=True).model_copy(update={"lines": ()})  # of a version that did not remove lines
     with_them, without = (

@@ -8,14 +8,16 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from models.commissioning.commissioned import install, load_commissioned
+from models.commissioning.commissioned import KnowledgeLevel, install, load_commissioned
+from models.commissioning.levels import HealthyPiece, Learned, Progress, learn
 from models.diagnosis.networks.bundle import load_bundle
-from models.machine import load_machine, load_machine_file
+from models.machine import MachineFile, load_machine, load_machine_file
 from simulator.rotortrain import app
 from simulator.stream import record
 from tests.commissioning.rotor_kit import LAB, stream
@@ -38,6 +40,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, duration_s, seed in (("monday", 70.0, 81), ("friday", 40.0, 82), ("short", 20.0, 83)):
         record(LAB, ((block, ()) for block in stream(duration_s, seed)), place / f"{name}.mcap")
     return place
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _learned_once() -> Iterator[None]:
+    """What is learned from the same recordings is the same; these tests look at what the command makes of it."""
+    known = dict[object, Learned]()
+
+    def learn_once(
+        level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyPiece], progress: Progress
+    ) -> Learned:
+        key = machine.model_dump_json(), *(piece.window.spectrum.tobytes() for piece in pieces)
+        if key not in known:
+            known[key] = learn(level, machine, pieces, progress)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("models.commissioning.commission.learn", learn_once)
+        yield
 
 
 def test_a_machine_is_commissioned_again_only_with_a_reason(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
