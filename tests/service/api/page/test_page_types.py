@@ -65,7 +65,7 @@ def as_type(schema: dict[str, Any]) -> str:
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Errors of TypeScript in the page as it is, and as it would be if the API had other fields and a module a fault.
+    """Errors of TypeScript in the page as it is, and in a few modules if the API had other fields and one a fault.
 
     TypeScript reads its own library once for both.
     """
@@ -82,8 +82,9 @@ def errors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         lines = (f"export type {name} = {as_type(one)};" for name, one in known.items())
         (folder / page / RECORDS).write_text("\n".join(lines))
     wrong = "/** @param {number} one */\nexport const twice = (one) => one.length;\n"
-    (folder / "wrong" / "twice.js").write_text(wrong)
-    said = found(folder, sorted(folder.rglob("*.js"))).split("\n\n")
+    (folder / "wrong" / "monitor" / "twice.js").write_text(wrong)
+    few = (folder / "wrong" / "monitor" / f"{name}.js" for name in ("monitor", "states", "twice"))
+    said = found(folder, [*sorted((folder / "right").rglob("*.js")), *few]).split("\n\n")
     return {page: "\n\n".join(one for one in said if f"/{page}/" in one) for page in ("right", "wrong")}
 
 
