@@ -9,7 +9,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import floor
 from pathlib import Path
 
@@ -25,12 +24,11 @@ from service.interchange.clock import Clock, clock_for
 from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
 from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
-from service.interchange.samples import Piece, Read, pieces, signals_of
+from service.interchange.samples import Piece, Read, check_one_rate, pieces, signals_of
 from service.interchange.source import Reference, SourceError
 from service.monitor.conversion import rfc3339
 
 _NOTED = 0.01  # fraction of rows lost from which a note is given
-_MOST_ALONE = 0.1  # largest fraction of isolated rows, i.e. with a gap on both sides
 _LISTED = 10
 _NAMED = 5
 _VARIED = 1.1  # ratio of highest to lowest speed from which both are stated
@@ -133,13 +131,7 @@ def _imported(
                 cut_rows = sum(overlap.cut_rows for overlap in overlaps)
                 if maker.written.blocks == 0:
                     raise SourceError(_nothing(path, machine, read, maker.written, cut_rows))
-                alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
-                if len(alone) > _MOST_ALONE * read.rows:
-                    raise SourceError(
-                        f"{path}: from row {alone[0] + 1} on, rows are isolated at {clock.rate_hz:.9g} Hz, "
-                        f"{len(alone)} of them; expected one rate throughout: import what has another rate by itself, "
-                        "with time.resample = true in the mapping, or fill such gaps with time.fill_gaps_up_to_s"
-                    )
+                check_one_rate(path, clock, read)
         except BaseException:
             writer.part.unlink(missing_ok=True)
             raise

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,9 @@ from models.signals.channels import Quantity, same_unit, unit_factor
 from service.interchange.clock import Clock, check_order
 from service.interchange.mapping import Column, Mapping
 from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
+
+# Largest number of isolated rows, i.e. with a gap on both sides, as part of all and in any file.
+_MOST_ALONE, _MANY_ALONE = 0.1, 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +64,17 @@ class Read:
     filled: int = 0  # rows inserted into short gaps
     # Rows left out because a cell (every cell, if channels may be missing) is empty, NaN, infinite or beyond the dtype.
     left_out: int = 0
+
+
+def check_one_rate(path: Path, clock: Clock, read: Read) -> None:
+    """Refuse rows of which too many are isolated; raises `SourceError`."""
+    alone = [one.row for one, following in pairwise(read.gaps) if following.row == one.row + 1]
+    if len(alone) > min(_MOST_ALONE * read.rows, _MANY_ALONE):
+        raise SourceError(
+            f"{path}: from row {alone[0] + 1} on, rows are isolated at {clock.rate_hz:.9g} Hz, "
+            f"{len(alone)} of them; expected one rate throughout: import what has another rate by itself, "
+            "with time.resample = true in the mapping, or fill such gaps with time.fill_gaps_up_to_s"
+        )
 
 
 def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:
@@ -194,6 +210,8 @@ class _Splitter:
             yield piece
         else:
             self._read.gaps.append(Gap(last.time_ns[-1] + self._step_ns, piece.time_ns[0], row, self._clock.path.name))
+            if len(self._read.gaps) % _MANY_ALONE == 0:  # before they fill the memory
+                check_one_rate(self._clock.path, self._clock, self._read)
             yield replace(piece, begins=True)
 
     def _bridge(self, last: Piece, piece: Piece, steps: int) -> Piece:

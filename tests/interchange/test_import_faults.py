@@ -134,6 +134,16 @@ def test_mistakes_in_a_table_are_named(
     assert all(part in text for part in said), text
 
 
+def test_a_file_of_another_rate_is_refused_before_its_gaps_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.interchange.samples._MANY_ALONE", 50)
+    rows = good_rows(4000)
+    assert "from row 3602 on, rows are isolated at 2000 Hz, 99 of them" in fault(
+        tmp_path, rows[:3600] + rows[3600::2], TEXT
+    )
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
