@@ -252,7 +252,7 @@ def parameter_reading(
         standard_error=standard_error,
         interval_95=interval_95(change, standard_error, least=-1.0) if known else None,
         z=change / standard_error if known and standard_error else None,
-        vector=None if vector is None else _stated(vector),
+        vector=None if vector is None else _stated(vector, seen=abs(change) > _DIRECTION_ERRORS * standard_error),
     )
 
 
@@ -275,7 +275,7 @@ def possible_reading(
     return no_reading(name, by, reason) if reason else parameter_reading(name, by, change, standard_error, vector)
 
 
-def _stated(vector: UnbalanceVector) -> VectorRecord:
+def _stated(vector: UnbalanceVector, *, seen: bool) -> VectorRecord:
     turned, turned_error = vector.turned_deg, vector.turned_error_deg
     return VectorRecord(
         magnitude_change=vector.magnitude_change,
@@ -285,7 +285,7 @@ def _stated(vector: UnbalanceVector) -> VectorRecord:
         change=vector.change,
         change_interval_95=interval_95(vector.change, vector.change_error, least=0.0),
         change_angle_deg=vector.change_angle_deg,
-        text=vector.sentence,
+        text="direction of its change not known" if seen and vector.change_angle_deg is None else vector.sentence,
     )
 
 

@@ -165,9 +165,12 @@ class LikelihoodFit:
             If the search finds no maximum, or nothing within the model comes near the window.
         """
         window, afresh, first = integrated(window), self._last is None, self._latest is None
+        followed = self._followed > 0
         found = self._searched(window)
         again = self._misfits > 0 and self._misfits % _MISFITS == 0
-        if again and not afresh:  # perhaps all of them have ended at a wrong maximum
+        # Perhaps all of them have ended at a wrong maximum; or the first one has, as the levels where following ended
+        # need not be those of any force, so that a search starts far off.
+        if (again or (followed and self._misfits == 1)) and not afresh:
             found = self._retried(window, found, self._corners, found.misfit_z or 0.0)
         misfit_z = found.misfit_z or 0.0
         if self._corners < CORNERS and (again or afresh) and misfit_z > _DOUBTFUL and (first or not found.unexplained):

@@ -63,18 +63,21 @@ def test_following_and_glancing_agree_with_a_full_search(layout: Layout) -> None
 
 
 def test_after_windows_that_misfit_a_better_maximum_is_searched_from_scratch() -> None:
-    """Searches that begin where the last one ended may stay near a wrong maximum, as after a change."""
+    """Searches that begin where the last one ended may stay near a wrong maximum, as after a change.
+
+    One that begins where following ended may do so at once, without a change.
+    """
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT, faults={"c_bz": -0.3})
     window, fit = simulate_window(draw, 0), LikelihoodFit(LAB)
     right, remembered = fit.diagnose(window), fit.checkpoint()
     remembered["last"][:5] += [0.5, -0.5, -1.5, 0.2, 0.1]
     found = []
-    for misfits in (0, 3):
-        remembered["followed"][2] = misfits
+    for followed, misfits in ((0, 0), (0, 3), (12, 0)):
+        remembered["followed"][1:3] = followed, misfits
         fit.restore(remembered)
         found.append(fit.diagnose(window))
     assert sure(found[0].misfit_z) > 4
-    assert found[1].parameters == right.parameters
+    assert found[1].parameters == found[2].parameters == right.parameters
 
 
 def test_a_glance_is_refused_after_a_change_and_before_the_first_search() -> None:

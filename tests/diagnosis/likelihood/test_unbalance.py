@@ -86,6 +86,15 @@ def test_an_angle_rounded_to_zero_has_no_sign() -> None:
     assert "(size +0 %, turned by −57°: the heavy spot" in UnbalanceVector(0.54, -0.84, 1e-8, 0.0, 1e-8).sentence
 
 
+@pytest.mark.parametrize(
+    ("change", "said"), [(0.29, "direction of its change not known"), (0.02, "no change of its vector")]
+)
+def test_a_change_whose_direction_is_uncertain_is_not_called_no_change(change: float, said: str) -> None:
+    """At the nominal phase the size may be known well where the phase itself is not."""
+    vector = UnbalanceVector(1 + change, 0.0, 0.0009, 0.0, 0.0144)
+    assert sure(parameter_reading("e", "likelihood", change, 0.03, vector).vector).text == said
+
+
 def test_1x_vectors_that_no_unbalance_causes_are_not_read_as_one() -> None:
     window = drawn(2)
     foreign = np.abs(sure(window.synchronous)) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
