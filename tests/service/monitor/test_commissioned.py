@@ -10,7 +10,7 @@ import pytest
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.levels.settings import LevelSettings
-from models.machine import AlarmSettings
+from models.machine import AlarmSettings, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
@@ -19,7 +19,16 @@ from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
+from tests.commissioning.rotor_kit import (
+    LAB,
+    NOTHING,
+    commissioned,
+    mounted,
+    recording,
+    samples_of,
+    stream,
+    with_samples,
+)
 from tests.service.rig.watching import feed
 from tests.sure import sure
 
@@ -107,6 +116,48 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
     for name in ("k_by", "c_by", "e"):
         assert now[name] > 0.9 * np.hypot(before[name], 0.03 * (1 + change * (name == "k_by")))
     assert now["k_bz"] < 1.1 * before["k_bz"]
+
+
+def factored(healthy: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
+    """Blocks in which channels are multiplied by factors."""
+    return with_samples(healthy, samples_of(healthy) * [factors.get(sensor.name, 1.0) for sensor in MACHINE.sensors])
+
+
+def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
+    """The relation was learned on so little data that a gain of y1 changes k_by by more than twice as much."""
+    ran = stream(65.0, SEED + 2)
+    plain, drifted = (
+        {one.name: one for one in full(feed(MachineMonitor(installed()), seen)[0])[-1].parameters}
+        for seen in (ran, factored(ran, y1=0.95))
+    )
+    wrong = sure(drifted["k_by"].relative_change) - sure(plain["k_by"].relative_change)
+    assert 0.08 < wrong < 1.1 * sure(drifted["k_by"].standard_error)
+
+
+def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
+    machine = MachineFile.model_validate(
+        mounted(LAB, dict.fromkeys(("y1", "y1_dot", "y2", "y2_dot"), (45.0, 135.0))).model_dump(
+            exclude={"rotor", "operation", "condition"}
+        )
+    )
+    names = [sensor.name for sensor in MACHINE.sensors]
+
+    def turned(seen: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
+        samples = samples_of(seen)
+        for first in ("y1", "y1_dot", "y2", "y2_dot"):
+            own, other = names.index(first), names.index(first.replace("y", "z"))
+            y, z = samples[:, own].copy(), samples[:, other].copy()
+            samples[:, own], samples[:, other] = (y + z) / np.sqrt(2), (z - y) / np.sqrt(2)
+        return factored(with_samples(seen, samples), **factors)
+
+    made = Installed(machine, None, commissioned(machine, recording(machine, turned(before()[:1500]))).commissioned)
+    ran = stream(65.0, SEED + 2)
+    plain, drifted = (
+        {one.name: one for one in full(feed(MachineMonitor(made), seen)[0])[-1].parameters[:5]}
+        for seen in (turned(ran), turned(ran, y2_dot=1.04))
+    )
+    for name, one in drifted.items():
+        assert sure(one.standard_error) > 0.9 * np.hypot(sure(plain[name].standard_error), 0.04)
 
 
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
