@@ -160,6 +160,13 @@ def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
         assert sure(one.standard_error) > 0.9 * np.hypot(sure(plain[name].standard_error), 0.04)
 
 
+def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
+    windows, _ = feed(MachineMonitor(installed()), factored(stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
+    dead, drifted = full(windows)[-1].sensors
+    assert dead.text.endswith("the machine is diagnosed without it")
+    assert drifted.text.endswith("the machine is diagnosed with larger errors")
+
+
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
     windows, events = feed(MachineMonitor(installed()), with_gain(1.08, stream(65.0, SEED + 1)))
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
