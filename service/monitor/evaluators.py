@@ -82,15 +82,18 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
-        self.takes_short = self.takes_dead = self._baselines != ()
+        self.takes_short = self._baselines != ()
         self._plan = plan_for(machine)
         self._drifts: tuple[SensorFault, ...] = ()
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
         """Also despite gains that have drifted a little: readings are widened by them."""
-        lost = super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
-        left = plan.states_without(lost or ())
-        return lost if not lost or any(one.reads(left) for _, one in self._baselines) else None
+        return super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
+
+    def suffices(self, left: Sequence[str], plan: Plan) -> bool:
+        """Whether a relation was learned between these states alone, see `WindowEvaluator`."""
+        _ = plan
+        return any(one.reads(left) for _, one in self._baselines)
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Also take note of gains that have drifted."""

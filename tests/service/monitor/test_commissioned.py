@@ -190,6 +190,15 @@ def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
     assert readings["e"].relative_change is not None
 
 
+def test_a_plane_is_diagnosed_without_any_sensor_of_the_other() -> None:
+    ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
+    dead = dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), np.nan)
+    windows, events = feed(MachineMonitor(installed()), factored(ran, **dead))
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-missing", "k_bz"}
+    read = {one.name for one in full(windows)[-1].parameters if one.relative_change is not None}
+    assert read == {"k_bz", "c_bz", "e"}
+
+
 def test_a_change_within_the_window_is_named_and_not_outside_the_model() -> None:
     """Windows across the change fit neither state of the machine; their latest data fit."""
     begins_s = 63.0
