@@ -130,9 +130,6 @@ class WindowEvaluator(ABC):
     takes_short: bool = False
     """Whether stretches shorter than the window can be evaluated."""
 
-    takes_dead: bool = False
-    """Whether windows can be evaluated without sensors that have no signal."""
-
     directed: bool = True
     """Whether the directions of vectors mean anything: the shaft angle has not jumped since the monitor was set up, and
     no window has contradicted an angle of the heavy spot that was assumed because the machine file gives none."""
@@ -157,14 +154,18 @@ class WindowEvaluator(ABC):
         """Sensors to leave out so that a window can be evaluated despite these faults; None if it cannot be.
 
         Faults of channels outside the equations do not matter, unless the machine has no equations. Sensors without a
-        signal are left out while most are left (`takes_dead`), but not if the speed is found in the vibration: the
+        signal are left out while enough are left (`suffices`), but not if the speed is found in the vibration: the
         strength of its line depends on which sensors are left.
         """
         own = [one for one in findings if not plan.states or not set(one.states).issubset(plan.others)]
         lost, dead = implicated(own), all(one.kind in _FAULTS_WITHOUT_SIGNAL for one in own)
-        most = self.takes_dead and plan.angle_column is not None and "theta" not in lost
-        enough = most and dead and len(plan.states_without(lost)) > len(plan.states) / 2
-        return tuple(sorted(lost)) if not own or enough else None
+        enough = dead and plan.angle_column is not None and "theta" not in lost
+        return tuple(sorted(lost)) if not own or (enough and self.suffices(plan.states_without(lost), plan)) else None
+
+    def suffices(self, left: Sequence[str], plan: Plan) -> bool:
+        """Whether windows can be evaluated with the states `left` of a plan's; never, unless a subclass says so."""
+        _ = left, plan
+        return False
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Take note of sensor faults: once the shaft angle has jumped, directions mean nothing any more."""

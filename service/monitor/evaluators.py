@@ -20,13 +20,14 @@ from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.isolation import misfit_beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
-from models.diagnosis.verdict.stretch import determined, stretch_of, with_shared_error
-from models.diagnosis.window.moments import Plan, states_of
+from models.diagnosis.verdict.stretch import determined, stretch_of, to_scale, with_shared_error
+from models.diagnosis.window.moments import Plan, plan_for, states_of
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
+from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, settled
 from service.monitor.known_machine import KnownMachineEvaluator
@@ -81,25 +82,23 @@ class BaselineEvaluator(WindowEvaluator):
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
-        self.takes_short = self.takes_dead = self._baselines != ()
-        self._drifted = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+        self.takes_short = self._baselines != ()
+        self._plan = plan_for(machine)
+        self._drifts: tuple[SensorFault, ...] = ()
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
-        """Also despite gains that have drifted a little: `heard` widens the readings by them."""
-        lost = super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
-        left = plan.states_without(lost or ())
-        return lost if not lost or any(one.reads(left) for _, one in self._baselines) else None
+        """Also despite gains that have drifted a little: readings are widened by them."""
+        return super().spared(plan, [one for one in findings if not (self._baselines and is_drift(one))])
+
+    def suffices(self, left: Sequence[str], plan: Plan) -> bool:
+        """Whether a relation was learned between these states alone, see `WindowEvaluator`."""
+        _ = plan
+        return any(one.reads(left) for _, one in self._baselines)
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
-        """Also take note of gains that have drifted.
-
-        A row's terms are proportional to its channels, so a change of its parameters reads wrong by at most some 1.3
-        times the drift (decision 0062).
-        """
+        """Also take note of gains that have drifted."""
         super().heard(findings)
-        drifted = [(one.states[0][0], one.value or 0.0) for one in findings if is_drift(one)]
-        by_parameter = [sum(size**2 for plane, size in drifted if name[-1] in (plane, "e")) for name in PARAMETERS]
-        self._drifted = np.diag(by_parameter)
+        self._drifts = tuple(filter(is_drift, findings))
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
@@ -135,9 +134,35 @@ class BaselineEvaluator(WindowEvaluator):
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
 
     def _diagnose(self, window: WindowStatistics) -> Diagnosis:
+        baseline = self._baseline_for(window)
         clear = (window.without_lines if self._lines else window).with_steady_rotation
-        read = determined(self._baseline_for(window).diagnose(clear), window, self._length_s)
-        return with_shared_error(read, self._drifted) if self._drifted.any() else read
+        read = baseline.diagnose(clear)
+        if self._drifts:
+            wrong = [self._wrong_by(one, read, baseline, clear) for one in self._drifts]
+            read = with_shared_error(read, np.diag(np.square(wrong).sum(axis=0)))
+        return determined(read, window, self._length_s)
+
+    def _wrong_by(
+        self, drift: SensorFault, read: Diagnosis, baseline: BaselineDiagnostician, window: WindowStatistics
+    ) -> FloatArray:
+        """How wrong a gain that has drifted may make each parameter, shape (6,), in the scale of `with_shared_error`.
+
+        At least by itself, as a row's terms are proportional to its channels, and by as much as a correction of the
+        sensor, or of either, changes the reading: several times that where the relation is not known well.
+        """
+        gain, unaffected = 1 + (drift.value or 0.0), self._plan.states_without(drift.states)
+        planes = {state[0] for state in self._plan.states if state not in unaffected}
+        sizes = np.array([abs(gain - 1) if name[-1] in {"e", *planes} else 0.0 for name in PARAMETERS])
+        kept = [self._plan.states.index(state) for state in window.states]
+        for state, factor in zip(reversed(drift.states), (1 / gain, gain), strict=False):
+            corrected = baseline.diagnose(window.turned(self._plan.gain(state, factor)[np.ix_(kept, kept)]))
+            values = {one.name: one.relative_change for one in corrected.evaluable}
+            for one in read.evaluable:
+                then, now = values.get(one.name), one.relative_change
+                if then is not None and now is not None:
+                    at = PARAMETERS.index(one.name)
+                    sizes[at] = max(sizes[at], abs(to_scale(one.name, then) - to_scale(one.name, now)))
+        return sizes
 
     def _newest(
         self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int, lost: tuple[str, ...]

@@ -1,6 +1,6 @@
 """Evaluation of a machine whose parameters are known, given or identified: its windows are compared with theory."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_readi
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window.moments import STEADY
+from models.diagnosis.window.moments import STEADY, Plan
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
@@ -52,7 +52,6 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     by = "likelihood"
     takes_short = True
-    takes_dead = True
 
     def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
         identified = None if commissioned is None else commissioned.identified
@@ -82,6 +81,10 @@ class KnownMachineEvaluator(WindowEvaluator):
             others.append(NetworkDiagnostician(machine, bundle.amortised))
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
+
+    def suffices(self, left: Sequence[str], plan: Plan) -> bool:
+        """Whether most states are left, as the theory holds for any set of sensors; see `WindowEvaluator`."""
+        return len(left) > len(plan.states) / 2
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""

@@ -8,6 +8,7 @@ import numpy as np
 from models.alarm_names import SHAPE
 from models.commissioning.commissioned import Installed
 from models.diagnosis.sensors.check import dead_sensors, sensor_findings
+from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.sensors.standstill import Standstill
 from models.diagnosis.verdict.calibration import detectable_changes
@@ -85,8 +86,9 @@ class WindowReporter:
         start_ns, faulty = statistics.start_ns, implicated(findings)
         faulted = lost != () or not faulty.issubset(self._plan.others)
         if faulted and lost is not None and not (stood or skipped):
-            remark = f"the machine is diagnosed {'without it' if lost else 'with larger errors'}"
-            findings = tuple(one.model_copy(update={"text": f"{one.text}; {remark}"}) for one in findings)
+            how = {True: "with larger errors", False: "without it"}
+            told = (f"{one.text}; the machine is diagnosed {how[is_drift(one)]}" for one in findings)
+            findings = tuple(one.model_copy(update={"text": text}) for one, text in zip(findings, told, strict=True))
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)
         self._data_path.sensors(findings, statistics, standing=bool(stood))

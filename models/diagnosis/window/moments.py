@@ -122,6 +122,12 @@ class Plan:
         part = np.abs(turn[:, np.isin(self.mounted, list(lost))]).sum(axis=1)
         return tuple(state for state, gone in zip(self.states, part.tolist(), strict=True) if not gone)
 
+    def gain(self, sensor: str, factor: float) -> FloatArray:
+        """Matrix, shape (n, n), by which the states change if the gain of a mounted sensor changes by a factor."""
+        turn = np.eye(len(self.states)) if self.turn is None else self.turn
+        factors = np.where(np.array(self.mounted) == sensor, factor, 1.0)
+        return np.asarray((turn * factors) @ np.linalg.inv(turn), dtype=np.float64)
+
     def motions(self, alive: npt.NDArray[np.bool_]) -> list[int]:
         """Columns of sensors that are alive, one for each motion."""
         twice = {pair.second for pair in self.pairs if alive[pair.first]}

@@ -124,6 +124,10 @@ class WindowStatistics:
             lines=tuple(line.turned(np.eye(len(self.states))[kept]) for line in self.lines),
         )
 
+    def turned(self, turn: FloatArray) -> "WindowStatistics":
+        """The same window with its states multiplied by a matrix, shape (n, n); sensors as mounted stay as they are."""
+        return _turned(self, self.states, turn)
+
     @property
     def rotation_vectors(self) -> ComplexArray | None:
         """Rotation-synchronous vectors of each hop, each from an angle that may be its own; None if unknown."""

@@ -10,7 +10,7 @@ import pytest
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.levels.settings import LevelSettings
-from models.machine import AlarmSettings
+from models.machine import AlarmSettings, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
@@ -19,7 +19,16 @@ from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
 from simulator.stream import blocks
-from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
+from tests.commissioning.rotor_kit import (
+    LAB,
+    NOTHING,
+    commissioned,
+    mounted,
+    recording,
+    samples_of,
+    stream,
+    with_samples,
+)
 from tests.service.rig.watching import feed
 from tests.sure import sure
 
@@ -109,6 +118,55 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
     assert now["k_bz"] < 1.1 * before["k_bz"]
 
 
+def factored(healthy: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
+    """Blocks in which channels are multiplied by factors."""
+    return with_samples(healthy, samples_of(healthy) * [factors.get(sensor.name, 1.0) for sensor in MACHINE.sensors])
+
+
+def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
+    """The relation was learned on so little data that a gain of y1 changes k_by by more than twice as much."""
+    ran = stream(65.0, SEED + 2)
+    plain, drifted = (
+        {one.name: one for one in full(feed(MachineMonitor(installed()), seen)[0])[-1].parameters}
+        for seen in (ran, factored(ran, y1=0.95))
+    )
+    wrong = sure(drifted["k_by"].relative_change) - sure(plain["k_by"].relative_change)
+    assert 0.08 < wrong < 1.1 * sure(drifted["k_by"].standard_error)
+
+
+def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
+    machine = MachineFile.model_validate(
+        mounted(LAB, dict.fromkeys(("y1", "y1_dot", "y2", "y2_dot"), (45.0, 135.0))).model_dump(
+            exclude={"rotor", "operation", "condition"}
+        )
+    )
+    names = [sensor.name for sensor in MACHINE.sensors]
+
+    def turned(seen: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
+        samples = samples_of(seen)
+        for first in ("y1", "y1_dot", "y2", "y2_dot"):
+            own, other = names.index(first), names.index(first.replace("y", "z"))
+            y, z = samples[:, own].copy(), samples[:, other].copy()
+            samples[:, own], samples[:, other] = (y + z) / np.sqrt(2), (z - y) / np.sqrt(2)
+        return factored(with_samples(seen, samples), **factors)
+
+    made = Installed(machine, None, commissioned(machine, recording(machine, turned(before()[:1500]))).commissioned)
+    ran = stream(65.0, SEED + 2)
+    plain, drifted = (
+        {one.name: one for one in full(feed(MachineMonitor(made), seen)[0])[-1].parameters[:5]}
+        for seen in (turned(ran), turned(ran, y2_dot=1.04))
+    )
+    for name, one in drifted.items():
+        assert sure(one.standard_error) > 0.9 * np.hypot(sure(plain[name].standard_error), 0.04)
+
+
+def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
+    windows, _ = feed(MachineMonitor(installed()), factored(stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
+    dead, drifted = full(windows)[-1].sensors
+    assert dead.text.endswith("the machine is diagnosed without it")
+    assert drifted.text.endswith("the machine is diagnosed with larger errors")
+
+
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
     windows, events = feed(MachineMonitor(installed()), with_gain(1.08, stream(65.0, SEED + 1)))
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
@@ -130,6 +188,15 @@ def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
     assert "y1" in readings["k_by"].reason
     assert abs(sure(readings["k_bz"].relative_change) + 0.35) < 3 * sure(readings["k_bz"].standard_error) < 0.2
     assert readings["e"].relative_change is not None
+
+
+def test_a_plane_is_diagnosed_without_any_sensor_of_the_other() -> None:
+    ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
+    dead = dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), np.nan)
+    windows, events = feed(MachineMonitor(installed()), factored(ran, **dead))
+    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-missing", "k_bz"}
+    read = {one.name for one in full(windows)[-1].parameters if one.relative_change is not None}
+    assert read == {"k_bz", "c_bz", "e"}
 
 
 def test_a_change_within_the_window_is_named_and_not_outside_the_model() -> None:
