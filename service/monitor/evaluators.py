@@ -138,31 +138,32 @@ class BaselineEvaluator(WindowEvaluator):
         clear = (window.without_lines if self._lines else window).with_steady_rotation
         read = baseline.diagnose(clear)
         if self._drifts:
-            wrong = [self._wrong_by(one, read, baseline, clear) for one in self._drifts]
-            read = with_shared_error(read, np.diag(np.square(wrong).sum(axis=0)))
+            wrong = [self._square_of(one, read, baseline, clear) for one in self._drifts]
+            read = with_shared_error(read, np.diag(np.sum(wrong, axis=0)))
         return determined(read, window, self._length_s)
 
-    def _wrong_by(
+    def _square_of(
         self, drift: SensorFault, read: Diagnosis, baseline: BaselineDiagnostician, window: WindowStatistics
     ) -> FloatArray:
-        """How wrong a gain that has drifted may make each parameter, shape (6,), in the scale of `with_shared_error`.
+        """Mean square error of each parameter by a gain that has drifted, (6,), in the scale of `with_shared_error`.
 
-        At least by itself, as a row's terms are proportional to its channels, and by as much as a correction of the
-        sensor, or of either, changes the reading: several times that where the relation is not known well.
+        It is the change by a correction of the sensor or, if either of two may be wrong, of each with equal
+        probability. What cannot be read then is taken to change by as much as the gain.
         """
         gain, unaffected = 1 + (drift.value or 0.0), self._plan.states_without(drift.states)
         planes = {state[0] for state in self._plan.states if state not in unaffected}
-        sizes = np.array([abs(gain - 1) if name[-1] in {"e", *planes} else 0.0 for name in PARAMETERS])
         kept = [self._plan.states.index(state) for state in window.states]
+        squares = np.zeros(len(PARAMETERS))
         for state, factor in zip(reversed(drift.states), (1 / gain, gain), strict=False):
+            changes = np.array([gain - 1 if name[-1] in {"e", *planes} else 0.0 for name in PARAMETERS])
             corrected = baseline.diagnose(window.turned(self._plan.gain(state, factor)[np.ix_(kept, kept)]))
             values = {one.name: one.relative_change for one in corrected.evaluable}
             for one in read.evaluable:
                 then, now = values.get(one.name), one.relative_change
                 if then is not None and now is not None:
-                    at = PARAMETERS.index(one.name)
-                    sizes[at] = max(sizes[at], abs(to_scale(one.name, then) - to_scale(one.name, now)))
-        return sizes
+                    changes[PARAMETERS.index(one.name)] = to_scale(one.name, then) - to_scale(one.name, now)
+            squares += changes**2 / len(drift.states)
+        return squares
 
     def _newest(
         self, sliding: SlidingWindow, test: SequentialTest, deciding: Diagnosis, latest: int, lost: tuple[str, ...]

@@ -146,7 +146,8 @@ class WindowReporter:
         self, end_ns: int, there: WindowStatistics | None, missing: tuple[SensorFault, ...], *, standing: bool
     ) -> Report:
         """Report on the hops that are `there`: no alarm clears, as other faults are looked for in full windows."""
-        dead = missing if there is None else dead_sensors(there, self._machine.sensors, missing)
+        # At a standstill, a sensor without a signal may be alive.
+        dead = missing if there is None or standing else dead_sensors(there, self._machine.sensors, missing)
         if dead and there is not None:
             self._data_path.sensors(dead, there, standing=True)
         self.levels.tell(self._alarms, end_ns, faulty=implicated(dead), standing=standing)

@@ -101,7 +101,7 @@ def with_gain(factor: float, healthy: Sequence[SampleBlock]) -> Sequence[SampleB
 
 @pytest.mark.parametrize("change", [0.0, -0.35])
 def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(change: float) -> None:
-    """Which of the two sensors has drifted is not known: the reading of k_by may be wrong by all of it."""
+    """Which of the two sensors has drifted is not known: the reading of k_by is wrong by all of it or hardly at all."""
     event = Event(at_s=0.0, parameter="k_by", relative_change=change)
     ran = stream(65.0, SEED + 2, *([event] if change else []))
     plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, with_gain(1.03, ran)))
@@ -114,7 +114,7 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
         {one.name: sure(one.standard_error) for one in full(fed[0])[-1].parameters[:5]} for fed in (plain, drifted)
     )
     for name in ("k_by", "c_by", "e"):
-        assert now[name] > 0.9 * np.hypot(before[name], 0.03 * (1 + change * (name == "k_by")))
+        assert now[name] > 0.9 * np.hypot(before[name], 0.02 * (1 + change * (name == "k_by")))
     assert now["k_bz"] < 1.1 * before["k_bz"]
 
 
@@ -131,7 +131,7 @@ def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
         for seen in (ran, factored(ran, y1=0.95))
     )
     wrong = sure(drifted["k_by"].relative_change) - sure(plain["k_by"].relative_change)
-    assert 0.08 < wrong < 1.1 * sure(drifted["k_by"].standard_error)
+    assert 0.08 < wrong < 1.5 * sure(drifted["k_by"].standard_error)
 
 
 def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
@@ -156,8 +156,8 @@ def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
         {one.name: one for one in full(feed(MachineMonitor(made), seen)[0])[-1].parameters[:5]}
         for seen in (turned(ran), turned(ran, y2_dot=1.04))
     )
-    for name, one in drifted.items():
-        assert sure(one.standard_error) > 0.9 * np.hypot(sure(plain[name].standard_error), 0.04)
+    for name in ("k_by", "k_bz"):
+        assert sure(drifted[name].standard_error) > 1.5 * sure(plain[name].standard_error)
 
 
 def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
