@@ -63,7 +63,7 @@ def _measure(
         "found": " ".join(dict.fromkeys(found.kind for found in findings)),
         "right": any(found.kind == _FAULTS[fault][1] and state in found.states for found in findings),
     }
-    # The machine is not diagnosed if a sensor fault is found.
+    # Blamed is what is named instead of a sensor fault; that dead sensors and drifts leave a diagnosis does not count.
     return [known if findings else known | opinion(diagnostician, window, (0.01,))]
 
 
