@@ -14,7 +14,7 @@ from rotorwatch.records.windows import Parameter
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
-from tests.service.rig.watching import feed, named, resumed
+from tests.service.rig.watching import at_once, feed, named, resumed
 
 LAB = load_machine("lab")
 SEED = 4_910_001
@@ -52,21 +52,22 @@ def test_without_an_unbalance_phase_in_the_file_any_heavy_spot_angle_is_healthy(
     """With a shaft angle or without, after a restart, in either sense of rotation; a mirror image turns backwards."""
     sensors = tuple(one for one in LAB.sensors if angle or one.name != "theta")
     mirror = np.array([-1.0 if backward and one.direction == "z" else 1.0 for one in sensors], dtype=np.float32)
-    larger = Event(at_s=80.0, parameter="e", relative_change=0.5)
-    parts = [replace(one, samples=one.samples[:, : len(sensors)] * mirror) for one in stream(145.0, phase_rad, larger)]
-    installed = Installed(LAB.model_copy(update={"sensors": sensors}))
+    larger = Event(at_s=45.0, parameter="e", relative_change=0.5)
+    parts = [replace(one, samples=one.samples[:, : len(sensors)] * mirror) for one in stream(80.0, phase_rad, larger)]
+    shorter = LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})
+    installed = Installed(LAB.model_copy(update={"sensors": sensors, "window": shorter}))
     going = MachineMonitor(installed)
-    windows, events = feed(going, parts[:750])
+    windows, events = feed(going, parts[:420])
     assert not events
     assert abs(e_of(windows[-1].parameters)) < 0.05
-    windows, events = feed(resumed(going, installed), parts[750:])
+    windows, events = feed(resumed(going, installed), parts[420:])
     assert [name for kind, name in named(events) if kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
     assert angle or all(one.vector is None for one in windows[-1].parameters)  # which needs an angle
 
 
 def test_with_an_unbalance_phase_in_the_file_another_angle_is_a_change() -> None:
-    windows, events = feed(MachineMonitor(Installed(with_heavy_spot(0.0))), stream(75.0, 2.5))
+    windows, events = feed(MachineMonitor(Installed(at_once(with_heavy_spot(0.0)))), stream(63.0, 2.5))
     assert [(event.alarm.name, event.alarm.severity) for event in events] == [("e", "alert")]  # its size is as before
     assert "turned by 143°: the heavy spot has moved, or the zero of the shaft angle" in events[0].text
     assert e_of(windows[-1].parameters) == pytest.approx(2 * math.sin(2.5 / 2), abs=0.1)

@@ -81,7 +81,7 @@ def test_a_dead_sensor_keeps_state_data_health_when_windows_are_not_evaluated(wh
 
 def test_a_dead_sensor_is_not_a_suspect_for_a_misfit() -> None:
     heavier = Event(at_s=0.0, anomaly="added_mass", size=0.25)
-    reports, _ = feed(MachineMonitor(install(KIT, None)), dying([0], 500.0, heavier, dead_s=42.0, end_s=58.0))
+    reports, _ = feed(MachineMonitor(install(KIT, None)), dying([0], 500.0, heavier, dead_s=31.0, end_s=43.0))
     suspects = {one.suspect for one in reports if one.filled == 1 and one.sensors}
     assert suspects - {""}
     assert not any(suspect.startswith("y1 ") for suspect in suspects)

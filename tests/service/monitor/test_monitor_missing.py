@@ -60,10 +60,9 @@ def usual(end_s: float, *, moved: bool = False) -> Sequence[Report]:
     return feed(MachineMonitor(Installed(elsewhere(KIT) if moved else SOON)), scenario_blocks(end_s))[0]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window(value: float) -> None:
+def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window() -> None:
     monitor, sound = MachineMonitor(install(SOON, None)), usual(85.0)
-    stream = list(without(Z1_DOT, FROM_S, TO_S, value, end_s=85.0))
+    stream = list(without(Z1_DOT, FROM_S, TO_S, end_s=85.0))
     reports, events = feed(monitor, stream)
     assert monitor.health().quality.refused_blocks == {}
     first_ns = stream[0].start_ns
@@ -90,7 +89,7 @@ def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window(value: 
 
 def test_s_max_is_not_stated_if_one_of_its_two_probes_is_missing() -> None:
     monitor = MachineMonitor(install(KIT, None))
-    reports, _ = feed(monitor, without(0, 31.0, 45.0, end_s=50.0))
+    reports, _ = feed(monitor, without(0, 31.0, 45.0, np.inf, end_s=50.0))  # no more of a number than NaN
     told = {level.channel: level for level in reports[-1].levels}
     assert (told["y1"].overall, told["y1"].s_max, told["z1"].s_max) == (None, None, None)
     assert told["z1"].overall is not None

@@ -1,9 +1,10 @@
 """A monitor fed without a network, and its output."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 from models.commissioning.commissioned import Installed
+from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import Report
 from service.monitor.alarms.alarm import AlarmEvent
@@ -18,6 +19,14 @@ def feed(target: MachineMonitor, stream: Iterable[SampleBlock]) -> tuple[list[Re
         windows += report.windows
         events += report.events
     return windows, events
+
+
+M = TypeVar("M", bound=MachineFile)
+
+
+def at_once(machine: M) -> M:
+    """The machine with alarms that wait for no further window."""
+    return machine.model_copy(update={"alarms": machine.alarms.model_copy(update={"on_delay_s": 0.0})})
 
 
 def named(events: Iterable[AlarmEvent]) -> list[tuple[str, str]]:

@@ -43,7 +43,7 @@ from tests.service.rig.live import (
     until,
 )
 from tests.service.rig.monitored import PLACE, client
-from tests.service.rig.watching import feed, named, raised
+from tests.service.rig.watching import at_once, feed, named, raised
 
 KB = 1024
 
@@ -116,7 +116,7 @@ def test_two_publishers_on_one_key_raise_a_conflict_alarm_with_their_runs() -> N
 
 @pytest.mark.parametrize("ahead", [0, pytest.param(1, marks=pytest.mark.long), 5])
 def test_forged_blocks_raise_a_conflict_and_no_machine_alarm(ahead: int) -> None:
-    monitor = MachineMonitor(install(LAB, None))
+    monitor = MachineMonitor(install(at_once(LAB), None))
     ours = scenario_blocks(70.0)
     for number, one in enumerate(ours):
         later = number + ahead
@@ -358,16 +358,14 @@ def test_forged_messages_in_the_monitors_name_do_not_enter_its_history(tmp_path:
         assert health["stream"]["publisher_alive"]
 
 
-DURATION_S = 68.0
+DURATION_S = 63.0
 SEED = 7_730_001
 LONG = pytest.mark.long
 
 
 def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]]:
     """Reports of full windows, and names of the alarms raised."""
-    machine = load_machine(name)
-    alarms = machine.alarms.model_copy(update={"on_delay_s": machine.window.hop_s})
-    machine = machine.model_copy(update={"alarms": alarms})
+    machine = at_once(load_machine(name))
     monitor = MachineMonitor(install(machine, None))
     windows, events = feed(monitor, as_blocks(machine, foreign(machine, kind, seed, DURATION_S)))
     return [one for one in windows if one.filled == 1], {name for what, name in named(events) if what == "raised"}
@@ -383,7 +381,7 @@ CASES = [
 @pytest.mark.parametrize(("name", "kind", "seed"), CASES)
 def test_no_parameter_is_blamed_for_a_stream_that_no_rotor_makes(name: str, kind: Foreign, seed: int) -> None:
     windows, raised = watched(name, kind, seed)
-    assert len(windows) >= 2
+    assert windows
     assert not raised & set(PARAMETERS)
     assert raised
     assert all(alarm == MODEL or alarm.startswith(DATA) for alarm in raised)
@@ -413,9 +411,9 @@ def test_no_parameter_is_blamed_if_the_file_is_of_another_rotor(factors: tuple[f
 
 @pytest.mark.parametrize(("gain", "unbalance", "name"), [(25.4, 1.0, MODEL), (1.0, 10.0, "e")])
 def test_wrong_units_raise_a_model_alarm_and_not_unbalance(gain: float, unbalance: float, name: str) -> None:
-    machine = load_machine("lab")
+    machine = at_once(load_machine("lab"))
     rotor = machine.rotor.model_copy(update={"e_m": unbalance * machine.rotor.e_m})
-    samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, 70.0).copy()
+    samples = simulated(machine.model_copy(update={"rotor": rotor}), SEED, DURATION_S).copy()
     samples[:, [channel.name != "theta" for channel in machine.sensors]] *= gain
     monitor = MachineMonitor(install(machine, None))
     _, events = feed(monitor, as_blocks(machine, samples))
