@@ -174,6 +174,8 @@ def test_without_a_shaft_angle_differing_unbalances_are_not_identified() -> None
 def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
     made = made_at("partial")
     assert made.report.verdict in {"commissioned", "limited"}
+    assert sure(made.commissioned).gyroscopic == "Eq. 27"
+    assert "gyroscopic" not in sure(made.commissioned).model_dump()
     errors = assert_identified(made, PARAMETERS)
     assert 0 < min(errors) <= max(errors) < 0.03
     machine = sure(made.machine)
