@@ -132,9 +132,9 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: py
 
     monkeypatch.setattr("models.diagnosis.networks.training._ROUNDS", 16)
     equation = EQUATIONS[0]
-    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 12, equation.kept_nominal), SHORT, SEED)
-    still = windows(SHORT, Purpose.CALIBRATION, 0, 6, equation.kept_nominal)
-    sizes = np.linspace(-0.3, 0.3, 10)
+    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 8, equation.kept_nominal), SHORT, SEED)
+    still = windows(SHORT, Purpose.CALIBRATION, 0, 5, equation.kept_nominal)
+    sizes = np.linspace(-0.3, 0.3, 6)
     changed = [
         (simulate_window(Draw(SHORT, SEED, Purpose.CALIBRATION, 1, faults=faults), number), faults)
         for number, size in enumerate(sizes.tolist())

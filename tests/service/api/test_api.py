@@ -11,7 +11,7 @@ import pytest
 
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
-from rotorwatch.records.alarms import Alarm, AlarmStates
+from rotorwatch.records.alarms import AlarmStates
 from rotorwatch.records.health import MEASURES, Health
 from rotorwatch.records.history import ReadingList, ReportList
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration
@@ -171,18 +171,6 @@ def test_readings_that_only_the_history_has_can_be_queried(seen: tuple[Runtime, 
 )  # fmt: skip
 def test_alarms_are_filtered(http: httpx.Client, query: str, names: list[str]) -> None:
     assert [one.name for one in answered(http.get(f"{PLACE}/alarms?{query}"), AlarmStates).alarms] == names
-
-
-def test_an_alarm_has_an_etag_of_its_version(http: httpx.Client) -> None:
-    answer = http.get(f"{PLACE}/alarms/k_by")
-    assert answer.headers["etag"] == '"0"'
-    assert answered(answer, Alarm) == answered(http.get(f"{PLACE}/alarms"), AlarmStates).alarms[0]
-    never = http.get(f"{PLACE}/alarms/data-clock")
-    assert never.headers["etag"] == '"-1"'
-    assert answered(never, Alarm).state == "normal"
-    assert problem(http.get(f"{PLACE}/alarms/nose"), 404).detail.startswith(
-        "demo/lab: no alarm nose; there are: k_by, c_by"
-    )
 
 
 def test_detectable_changes_of_each_parameter(http: httpx.Client) -> None:
