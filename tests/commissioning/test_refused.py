@@ -90,7 +90,8 @@ def of_displacements(order: Sequence[str], sign: str = "") -> Commissioning:
 def no_such_rotor() -> Commissioning:
     masses = {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.3 * LAB.rotor.m2_kg}
     wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=masses)})
-    return made_of(stream(45.0, 43), wrong)
+    machine, blocks = with_sensors(wrong, stream(45.0, 43), lambda sensor: sensor.direction != "z")
+    return made_of(blocks, machine)
 
 
 RUNNING_AWAY = Event(at_s=0.0, ramp_s=70.0, speed_rpm=2 * LAB.operation.speed_rpm)
