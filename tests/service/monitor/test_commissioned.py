@@ -10,7 +10,7 @@ import pytest
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.levels.settings import LevelSettings
-from models.machine import AlarmSettings, MachineFile
+from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
@@ -29,13 +29,13 @@ from tests.commissioning.rotor_kit import (
     stream,
     with_samples,
 )
-from tests.service.rig.watching import feed
+from tests.service.rig.watching import at_once, feed
 from tests.sure import sure
 
 SEED = 71
 _FULL = 625
 """Blocks of a full window."""
-MACHINE = NOTHING.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0)})
+MACHINE = at_once(NOTHING)
 
 
 def before() -> Sequence[SampleBlock]:
@@ -234,12 +234,7 @@ def test_a_speed_not_commissioned_is_not_evaluable_and_raises_only_levels() -> N
     ("clearance_m", "size", "of"),
     [
         pytest.param(4e-5, 2.0, installed, id="heavy"),
-        pytest.param(
-            8e-5,
-            0.5,
-            lambda: Installed(LAB.model_copy(update={"alarms": MACHINE.alarms})),
-            id="light, not commissioned",
-        ),
+        pytest.param(8e-5, 0.5, lambda: Installed(at_once(LAB)), id="light, not commissioned"),
     ],
 )
 def test_a_rub_is_suspected_and_names_uncertain(clearance_m: float, size: float, of: Callable[[], Installed]) -> None:

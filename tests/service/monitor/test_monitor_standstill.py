@@ -14,6 +14,7 @@ from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
 from rotorwatch.records.health import HealthState, Report
+from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
 from tests.commissioning.rotor_kit import commissioned, recording
 from tests.service.rig.live import LAB, scenario_blocks
@@ -68,19 +69,17 @@ def stopped() -> Sequence[SampleBlock]:
 
 
 @cache
-def usual() -> Sequence[Report]:
-    return feed(monitor_of(KIT), stopped())[0]
+def usual() -> tuple[list[Report], list[AlarmEvent]]:
+    return feed(monitor_of(KIT), stopped())
 
 
 def test_a_stop_and_start_raise_no_alarm_and_the_machine_is_healthy_again() -> None:
-    stream = stopped()
+    stream, (reports, events) = stopped(), usual()
+    assert events == []
     half = len(stream) // 2  # while it stands
     monitor = monitor_of(KIT)
-    reports, events = feed(monitor, stream[:half])
-    after, rest = resumed(monitor, Installed(KIT)), feed(monitor, stream[half:])
-    assert feed(after, stream[half:]) == rest
-    reports += rest[0]
-    assert events + rest[1] == []
+    before, _ = feed(monitor, stream[:half])
+    assert feed(resumed(monitor, Installed(KIT)), stream[half:]) == (reports[len(before) :], [])
     states = {round((one.end_ns - stream[0].start_ns) / 1e9): one.state for one in reports}
     assert states[38] is states[148] is HealthState.HEALTHY
     standing = [one for one in reports if "the machine is at a standstill" in one.reason]
@@ -102,7 +101,7 @@ def test_a_stop_with_a_dead_channel_adds_no_other_sensor_fault(dead: int) -> Non
         replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
         for block in stopped()
     ]
-    for one, other in zip(feed(monitor_of(KIT), silent)[0], usual(), strict=True):
+    for one, other in zip(feed(monitor_of(KIT), silent)[0], usual()[0], strict=True):
         found, known = ({fault.states for fault in each.sensors} for each in (one, other))
         assert found - {(name,)} == {states for states in known if name not in states}
 
