@@ -43,7 +43,8 @@ def test_forward_whirl_rises_with_speed_only_in_the_opposite_sense() -> None:
 
 
 def test_a_healthy_machine_of_the_opposite_sense_is_healthy() -> None:
-    going = MachineMonitor(Installed(LAB))
+    installed = Installed(at_once(LAB))
+    going = MachineMonitor(installed)
     windows, events = feed(going, stream(75.0, SEED)[:700])
     assert not events
     full = [window for window in windows if window.filled == 1.0]
@@ -52,7 +53,7 @@ def test_a_healthy_machine_of_the_opposite_sense_is_healthy() -> None:
     assert {window.gyroscopic for window in full} == {"opposite"}
     assert '"gyroscopic":"opposite"' in full[-1].model_dump_json()
     rest = stream(75.0, SEED)[700:]
-    assert feed(resumed(going, Installed(LAB)), rest) == feed(going, rest)
+    assert feed(resumed(going, installed), rest) == feed(going, rest)
 
 
 def test_a_change_from_the_beginning_is_named_in_the_opposite_sense() -> None:

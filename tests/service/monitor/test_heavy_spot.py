@@ -57,10 +57,10 @@ def test_without_an_unbalance_phase_in_the_file_any_heavy_spot_angle_is_healthy(
     shorter = LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})
     installed = Installed(LAB.model_copy(update={"sensors": sensors, "window": shorter}))
     going = MachineMonitor(installed)
-    windows, events = feed(going, parts[:420])
+    windows, events = feed(going, parts[:430])
     assert not events
     assert abs(e_of(windows[-1].parameters)) < 0.05
-    windows, events = feed(resumed(going, installed), parts[420:])
+    windows, events = feed(resumed(going, installed), parts[430:])
     assert [name for kind, name in named(events) if kind == "raised"] == ["e"]
     assert e_of(windows[-1].parameters) == pytest.approx(0.5, abs=0.1)
     assert angle or all(one.vector is None for one in windows[-1].parameters)  # which needs an angle
