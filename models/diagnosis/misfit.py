@@ -64,6 +64,27 @@ class AlternativeTest:
         return f"{self.name} ({size})" if abs(change) <= most else self.name
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """A cause outside the model, as which changes of parameters a window would show it, and what shows it besides."""
+
+    name: str
+    # (6,): changes read per unit of it, in the order of `PARAMETERS` and the scale of their errors (see `Stretch`)
+    taken_for: FloatArray
+    information: float  # on its size, beyond what parameters imitate
+    score: float  # of the window, with that variance
+
+    def fitted(self, vector: FloatArray, information: FloatArray, known: Sequence[int]) -> tuple[float, float]:
+        """Its size if it alone is the cause, and how much it explains, in squared standard errors.
+
+        `vector` and `information` are those of a stretch (`Stretch`), with the parameters `known` alone.
+        """
+        taken = self.taken_for[list(known)]
+        weight = float(taken @ information @ taken) + self.information
+        seen = float(taken @ vector) + self.score
+        return (seen / weight, seen**2 / weight) if weight > 0 else (0.0, 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Goodness:
     """How well the theory explains a window."""

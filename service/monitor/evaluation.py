@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming, implicated
@@ -166,6 +167,14 @@ class WindowEvaluator(ABC):
         """Whether windows can be evaluated with the states `left` of a plan's; never, unless a subclass says so."""
         _ = left, plan
         return False
+
+    def rivals(self, *, wanted: bool) -> tuple[Rival, ...]:
+        """Causes outside the model that the latest window might show, if `wanted`; none unless a subclass knows any.
+
+        To be called once after each evaluation, as it ends the window's claim on memory.
+        """
+        _ = wanted
+        return ()
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
         """Take note of sensor faults: once the shaft angle has jumped, directions mean nothing any more."""

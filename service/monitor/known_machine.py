@@ -11,6 +11,7 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, in_sense
 from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.misfit import Rival
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
@@ -227,6 +228,10 @@ class KnownMachineEvaluator(WindowEvaluator):
                     decided = self._decide(statistics, partial(self._likelihood.short, hops, closely=closely))
                     evaluated[hops] = self._require_steady_speed(statistics, self._check_unbalance(decided))
         return evaluated
+
+    def rivals(self, *, wanted: bool) -> tuple[Rival, ...]:
+        """Causes outside the model that the latest window might show, see `WindowEvaluator`."""
+        return self._likelihood.rivals(wanted=wanted)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Starting points of the likelihood search, and what was found out so far; networks have no state."""

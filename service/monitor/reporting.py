@@ -22,7 +22,7 @@ from models.levels.judgement import growth_seen
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.fields import finite
 from rotorwatch.records.health import HealthState, Report
-from rotorwatch.records.windows import SensorFault
+from rotorwatch.records.windows import SensorFault, Verdict
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.evaluators import evaluator_for
@@ -116,7 +116,10 @@ class WindowReporter:
         verdict = test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
         unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
         astride_s = test.astride_s if evaluation.alone and not foreign.text else 0.0
-        explains = self._alarms.found(verdict, test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides)
+        verdict, rival = self._beside_rivals(verdict)
+        explains = self._alarms.found(
+            verdict, test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides, rival=rival
+        )
         levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
         reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:
@@ -141,6 +144,15 @@ class WindowReporter:
             reason=reason,
             shapes=evaluation.shapes,
         )
+
+    def _beside_rivals(self, verdict: Verdict) -> tuple[Verdict, str | None]:
+        """The verdict, and what outside the model explains the data as well; see `AlarmBook.found`."""
+        rivals = self.evaluator.rivals(wanted=verdict.changed != ())
+        if not rivals:
+            return verdict, None
+        rival = self.test.rival([one.name for one in verdict.changed], rivals)
+        text = f"{verdict.text}; a change of {rival} explains the data as well"
+        return verdict.model_copy(update={"low_confidence": True, "text": text}) if rival else verdict, rival
 
     def _while_it_fills(
         self, end_ns: int, there: WindowStatistics | None, missing: tuple[SensorFault, ...], *, standing: bool

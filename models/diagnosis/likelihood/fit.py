@@ -7,10 +7,11 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, unexplained_at, unseen
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
+from models.diagnosis.likelihood.rivals import rivals_at
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import (
     CORNERS,
@@ -30,6 +32,7 @@ from models.diagnosis.likelihood.spectral_model import (
     usual_force,
 )
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
+from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
@@ -86,6 +89,7 @@ class LikelihoodFit:
         self._line_band: _Band | None = None
         self._latest: tuple[SpectralModel, Expected, FloatArray, float] | None = None
         self._said: tuple[Diagnosis, Unbalance, ComplexArray] | None = None  # with the window's synchronous vector
+        self._rivals: Callable[[], tuple[Rival, ...]] = tuple  # of the window diagnosed last: megabytes
         self._groups: dict[bytes, BinGroups] = {}
 
     def reset(self) -> None:
@@ -165,6 +169,7 @@ class LikelihoodFit:
             If the search finds no maximum, or nothing within the model comes near the window.
         """
         window, afresh, first = integrated(window), self._last is None, self._latest is None
+        self._rivals = tuple
         followed = self._followed > 0
         found = self._searched(window)
         again = self._misfits > 0 and self._misfits % _MISFITS == 0
@@ -225,6 +230,8 @@ class LikelihoodFit:
         usual = window.synchronous
         self._said = None if unbalance is None or usual is None else (read, unbalance, usual)
         unexplained = unexplained or self._too_stiff(read)
+        at = weights, found, structural, speed, window.duration_s, read.unbalance
+        self._rivals = partial(rivals_at, model, *at)
         return replace(
             read,
             misfit_z=goodness.misfit_z,
@@ -244,6 +251,13 @@ class LikelihoodFit:
         self._machine = machine
         read, _ = self._read(integrated(window), *self._latest)
         return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
+
+    def rivals(self, *, wanted: bool) -> tuple[Rival, ...]:
+        """Causes outside the model that the window diagnosed last might show; once, and none unless `wanted`."""
+        rivals, self._rivals = self._rivals, tuple
+        with suppress(np.linalg.LinAlgError):
+            return rivals() if wanted else ()
+        return ()
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
         """Read the newest hops of the window diagnosed last by one step from the window's maximum.

@@ -7,6 +7,7 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import integrated
+from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window.moments import through
 from models.diagnosis.window.sliding import SlidingWindow
@@ -50,6 +51,12 @@ class LengthFits:
         """Estimate the parameters of the window at the next hop; raises as `LikelihoodFit.diagnose`."""
         self._hop += 1
         return self._window.diagnose(window)
+
+    def rivals(self, *, wanted: bool) -> tuple[Rival, ...]:
+        """Causes outside the model that the latest window might show, see `LikelihoodFit.rivals`."""
+        for fit in self._short.values():
+            fit.rivals(wanted=False)
+        return self._window.rivals(wanted=wanted)
 
     def has_news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> bool:
         """Whether the newest hops, at any of these lengths, may differ from the window or from the nominal machine.

@@ -97,7 +97,7 @@ def estimate_unbalance(
     moved = H @ force
     slopes = -(model.dynamic_changes(structural, speed_rad_s) @ moved) @ H.T  # ∂H = -H ∂D H
     g, *slopes = model.measured(np.vstack([moved, slopes]).T[np.newaxis], w)[0].T
-    noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
+    noise = 4 * around_rotation(model, point, speed_rad_s, duration_s) / duration_s
     combined = model.motions.combine(w)
     q = (combined @ synchronous)[0]
     weighted = np.linalg.solve(noise, g)
@@ -107,13 +107,13 @@ def estimate_unbalance(
         q, ratio = q * (abs(ratio) / ratio), complex(abs(ratio))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
     own = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
-    q2, g2 = _parts(q), _parts(g)
-    both = np.stack([g2, _parts(1j * g)], axis=1)
+    q2, g2 = parts(q), parts(g)
+    both = np.stack([g2, parts(1j * g)], axis=1)
     values, variances, with_structural = np.empty(3), np.empty(3), np.empty((3, len(STRUCTURAL)))
-    J = _parts(np.stack(slopes) * ratio).T
+    J = parts(np.stack(slopes) * ratio).T
     apart = _contradiction(q2, both, own + J @ covariance @ J.T, np.maximum(np.abs(q), np.abs(g)))
     for design, at, expected in ((g2[:, None], [0], ratio.real), (both, [1, 2], ratio)):
-        J = _parts(np.stack(slopes) * expected).T
+        J = parts(np.stack(slopes) * expected).T
         total = own + J @ covariance @ J.T + apart
         weight = np.linalg.solve(total, design).T
         precision = weight @ design
@@ -131,7 +131,7 @@ def estimate_unbalance(
     return UnbalanceRatios(values, variances, float(spread[0, 1]), with_structural, foreign, weights, explained)
 
 
-def _parts(vectors: ComplexArray) -> FloatArray:
+def parts(vectors: ComplexArray) -> FloatArray:
     """Real parts, then imaginary parts."""
     return np.concatenate([vectors.real, vectors.imag], axis=-1)
 
@@ -211,9 +211,7 @@ def estimate_unbalance_by_hop(
     ).decided(directed=directed and not sized)
 
 
-def _around_rotation(
-    machine: Machine, model: SpectralModel, point: Expected, speed_rad_s: float, duration_s: float
-) -> ComplexArray:
+def around_rotation(model: SpectralModel, point: Expected, speed_rad_s: float, duration_s: float) -> ComplexArray:
     """Stochastic cross-spectrum under the kernel of a rectangular window of this length, centred on Ω, shape (n, n).
 
     At the frequencies Ω ± (k + ½)/T the kernel has the weights 1/(π(k + ½))². Its tails are long: with one source, the
@@ -223,7 +221,7 @@ def _around_rotation(
     groups = model.groups
     centre_hz = speed_rad_s / (2 * np.pi)
     distance_hz = np.abs(groups.centre_hz - centre_hz)
-    spacing_hz = 1 / machine.window.segment_s
+    spacing_hz = 1 / model.machine.window.segment_s
     edge_hz = max(float(np.min(distance_hz - groups.bins * spacing_hz / 2)), spacing_hz)
     k = np.arange(max(1, round(edge_hz * duration_s))) + 0.5
     weights = np.tile((np.pi * k) ** -2.0, 2)

@@ -13,7 +13,7 @@ spread of possible sizes included. The confidence is the posterior probability u
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations, compress
@@ -21,6 +21,7 @@ from itertools import combinations, compress
 import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
 
+from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, possible_reading
 from models.diagnosis.verdict.calibration import Thresholds, widened, window_thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
@@ -29,6 +30,8 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Alternative, Parameter
 
 _LIKELIEST = 4  # most probable sets, which are reported whatever they hold
+_LEAST_PART = 0.75  # of what parameters explain, the least that another cause must
+_SURE_AGAINST = 2 * math.log(9)  # twice the logarithm of the odds at which parameters are sure against another cause
 _BY_PAIRS = 0.1  # false alarms by two parameters together, over those of the declared rate
 
 
@@ -125,6 +128,26 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         outside_confidence=confidence,
         alternatives=_alternatives(stretch.names, members, weight, explained) if changed else (),
     )
+
+
+def rival_of(stretch: Stretch, names: Collection[str], rivals: Sequence[Rival], thresholds: Thresholds) -> str:
+    """Causes outside the model that explain a stretch as well as changes of some parameters, the best first.
+
+    A cause is one unknown and pays the price of one parameter. The parameters must be as sure against it as a name must
+    be, unless it leaves much of what they explain. The slopes of a cause hold while it is small: of a size s, about
+    s²/2 of what it explains is allowed for.
+    """
+    if not (chosen := [i for i in stretch.known if PARAMETERS[i] in names]):
+        return ""
+    own, known = stretch.vector[chosen], list(stretch.known)
+    explained = float(own @ np.linalg.solve(stretch.information[np.ix_(chosen, chosen)], own))
+    least = max(explained - (len(chosen) - 1) * thresholds.further**2 - _SURE_AGAINST, _LEAST_PART * explained)
+    as_well: dict[str, float] = {}
+    for rival in rivals:
+        size, by_it = rival.fitted(stretch.vector[known], stretch.information[np.ix_(known, known)], known)
+        if abs(size) < 1 and by_it > least - size**2 / 2 * explained:
+            as_well[rival.name] = max(as_well.get(rival.name, 0.0), by_it)
+    return " or ".join(sorted(as_well, key=lambda name: -as_well[name]))
 
 
 @lru_cache

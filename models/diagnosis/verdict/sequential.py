@@ -21,9 +21,10 @@ from datetime import UTC, datetime
 import numpy as np
 from scipy.special import ndtr
 
+from models.diagnosis.misfit import Rival
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
 from models.diagnosis.verdict.change_point import read_changes
-from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of
+from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of, rival_of
 from models.diagnosis.verdict.sequential_state import SequentialState, finding
 from models.diagnosis.verdict.stretch import Stretch, added
 from models.machine import MachineFile
@@ -100,6 +101,8 @@ class SequentialTest:
         self.state = SequentialState()
         # Why no parameter is named or read at the latest hop, see `Diagnosis`; empty if it is evaluable.
         self.unexplained = ""
+        # The stretch that decided at the latest hop, or the window if that was shorter.
+        self._decided: Stretch | None = None
         self._by = by
         self._thresholds = settings.thresholds
         self._contradiction = window_thresholds(_CONTRADICTION_RATE, len(PARAMETERS)).first
@@ -184,6 +187,7 @@ class SequentialTest:
         found = {hops: isolate(look, self._thresholds(hops), self._by) for hops, look in loud.items()}
         verdicts = {hops: verdict for hops, verdict in found.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
+        self._decided = max(decided, every[window_hops], key=lambda look: look.duration_s)
         if unexplained:
             # Earlier findings stay: data that say nothing neither confirm nor withdraw them.
             isolation = replace(isolation, changed=())
@@ -209,6 +213,11 @@ class SequentialTest:
             settled=window_hops in clean and self._changed_by_ns() <= clean[window_hops].start_ns + self._slack_ns,
             current=current,
         )
+
+    def rival(self, changed: Collection[str], rivals: Sequence[Rival]) -> str:
+        """Causes outside the model that explain the latest hop as well as these changes, see `rival_of`."""
+        hops = self.settings.window_hops
+        return "" if self._decided is None else rival_of(self._decided, changed, rivals, self._thresholds(hops))
 
     def _is_loud(self, hops: int, look: Stretch) -> bool:
         """Whether a stretch may name anything: no set explains more than all parameters together."""

@@ -31,6 +31,7 @@ class Alarm:
     low_confidence: bool = False
     taken_back: bool = False  # it still reads as changed, but another parameter may have changed instead
     note: str = ""
+    rival: str = ""  # causes outside the model of which a change explains the data as well
     evidence: Evidence | None = None
     shelf: Shelf | None = None
     rules: tuple[str, ...] = ()  # identities of the rules that suppress it now; empty if none, whatever the state
@@ -91,7 +92,8 @@ class AlarmEvent:
         half = Z95 * (alarm.standard_error or 0.0)
         digits = percent_digits(half)
         size = f"{alarm.change or 0.0:+.{digits}%} ± {half:.{digits}%}" + (f": {alarm.note}" if alarm.note else "")
-        reserve = " (low confidence: another cause is possible)" if alarm.low_confidence else ""
+        cause = f"a change of {alarm.rival} explains the data as well" if alarm.rival else "another cause is possible"
+        reserve = f" (low confidence: {cause})" if alarm.low_confidence else ""
         if self.kind is EventKind.RAISED:
             return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"
         if self.kind is EventKind.ESCALATED:

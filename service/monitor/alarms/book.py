@@ -102,6 +102,7 @@ class AlarmBook:
         astride_s: float = 0.0,
         *,
         hidden: bool = False,
+        rival: str | None = None,
     ) -> bool:
         """Judge the sequential test's verdict at the end of a hop; without clean data alarms stay as they are.
 
@@ -118,6 +119,9 @@ class AlarmBook:
         hidden : bool
             Whether the suspect hides what parameters do: none is named then, and none that was named is taken back. If
             a parameter explains the data as well, so that they are not outside the model, both are candidates.
+        rival : str, optional
+            Cause outside the model that explains the data as well as the changes of the verdict; empty if none does,
+            None if nobody has looked.
         """
         named, outside = [finding.name for finding in verdict.changed], verdict.outside_model
         unreserved = set(named)
@@ -158,6 +162,7 @@ class AlarmBook:
                     or hidden
                     or held_stiff
                     or (unlike and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
+                    rival=rival if reading.name in named else None,
                     growth=larger if reading.name == "e" else None,
                     evidence=evidence,
                     note=_HELD_STIFF_NOTE if held_stiff else "" if reading.vector is None else reading.vector.text,
@@ -171,7 +176,7 @@ class AlarmBook:
             # Outside the model no candidate need be right, which alarm `model` says; and one cause has one alarm.
             told = outside or any(self.present(name) for name in probability)
             unsure = [] if sure or told else named
-            rival = [suspect] if hidden and suspect else []  # stated however little the parameter would have changed
+            beside = [suspect] if hidden and suspect else []  # stated however little the parameter would have changed
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
@@ -179,15 +184,15 @@ class AlarmBook:
             ]
             # With their probabilities if parameters are the only candidates.
             candidates = [
-                f"{one.text} ({one.name})" + ("" if rival else f" {one.probability:.0%}") for one in verdict.candidates
+                f"{one.text} ({one.name})" + ("" if beside else f" {one.probability:.0%}") for one in verdict.candidates
             ]
             self.update_state(
                 CHANGED,
-                any(change > limits.raise_above or rival for change, limits in changes),
+                any(change > limits.raise_above or beside for change, limits in changes),
                 end_ns,
-                " or ".join(candidates + rival),
+                " or ".join(candidates + beside),
                 evidence=evidence,
-                danger=any(change > limits.danger_above and not rival for change, limits in changes),
+                danger=any(change > limits.danger_above and not beside for change, limits in changes),
             )
         if verdict.current or unexplained or outside:
             at_once = f"{', '.join(named)} seem to have changed at the same time, so none is named" if another else ""
@@ -196,7 +201,7 @@ class AlarmBook:
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
         heard = any(self._alarms[one].due for one in (*probability, CHANGED) if one in self._alarms)
-        return bool(unreserved) and heard and not (outside or hidden)
+        return bool(unreserved) and heard and not (outside or hidden or rival)
 
     def update(  # noqa: PLR0913  # what one reading says
         self,
@@ -208,6 +213,7 @@ class AlarmBook:
         named: bool,
         taken_back: bool = False,
         low_confidence: bool = False,
+        rival: str | None = None,
         growth: float | None = None,
         evidence: Evidence | None = None,
         note: str = "",
@@ -220,6 +226,8 @@ class AlarmBook:
             Whether the parameter is among those found to have changed.
         taken_back : bool
             Whether a whole window after the change says that it is not.
+        rival : str, optional
+            See `found`; None leaves it as it was.
         growth : float, optional
             Relative increase of the load on the machine, if it differs from the change: an unbalance that has only
             turned, or has become smaller, is not dangerous.
@@ -227,11 +235,16 @@ class AlarmBook:
         if not (math.isfinite(change) and 0 < standard_error < math.inf):
             return ()
         limits, size = self._settings.for_parameter(parameter), abs(change)
+        known = self._alarm_named(parameter, time_ns)
+        if rival is None:
+            rival = known.rival if known.due else ""
+        low_confidence |= rival != ""
         alarm = replace(
-            self._alarm_named(parameter, time_ns),
+            known,
             change=change,
             standard_error=standard_error,
             low_confidence=low_confidence,
+            rival=rival,
             taken_back=taken_back and size >= limits.clear_below,
             evidence=evidence,
             note=note,

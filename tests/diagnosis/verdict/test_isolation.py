@@ -7,9 +7,10 @@ import pytest
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Z95, Diagnosis, no_reading, parameter_reading, possible_reading
-from models.diagnosis.verdict.calibration import agreements, beside, month_thresholds
-from models.diagnosis.verdict.isolation import Isolation, isolate, isolate_window, outside_confidence
+from models.diagnosis.verdict.calibration import agreements, beside, month_thresholds, window_thresholds
+from models.diagnosis.verdict.isolation import Isolation, isolate, isolate_window, outside_confidence, rival_of
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.errors import EstimationError
 from models.levels.judgement import Foreign
@@ -264,3 +265,26 @@ def test_parameters_rival_a_wrong_gain_where_damping_or_1x_allows_it(c_by: float
     assert evaluation.rivals(gain._replace(unlike=30.0)) == ("k_by", "c_by")
     assert evaluation.rivals(gain._replace(direction="z")) == ()
     assert evaluation.rivals(Foreign("a line", hides=True)) == ()
+
+
+def test_a_cause_is_a_rival_of_the_parameters_only_if_it_explains_as_much() -> None:
+    """Readings with errors of 2 %, uncorrelated; the cause lowers all of them alike."""
+    cov, limits = 0.02**2 * np.eye(6), window_thresholds(1e-6, 6)
+    alike = Rival("the disc's mass", -np.ones(6), 0.0, 0.0)
+
+    def rivals(values: FloatArray, names: tuple[str, ...], cause: Rival = alike) -> str:
+        return rival_of(stretch_of(window(values, cov), 0, 1), names, [cause], limits)
+
+    one, every = np.array([-0.2, 0, 0, 0, 0, 0]), np.full(6, -0.1)
+    assert not rivals(one, ("k_by",))
+    assert rivals(every, ("k_by",)) == "the disc's mass"
+    assert rivals(every, PARAMETERS) == "the disc's mass"  # one unknown in place of six
+    assert not rivals(0 * every, ())
+    # Where the spectra would show the cause, and do not, it is none.
+    shown = 1e6
+    assert not rivals(every, PARAMETERS, Rival("the disc's mass", -np.ones(6), shown, 0.0))
+    assert rivals(every, PARAMETERS, Rival("the disc's mass", -np.ones(6), shown, 0.1 * shown)) == "the disc's mass"
+    # Large changes are not as the slopes of the cause say: it may miss some of them, but not all.
+    assert rivals(np.array([-0.5, -0.5, -0.5, -0.5, -0.5, -0.4]), PARAMETERS) == "the disc's mass"
+    assert not rivals(np.array([-0.5, -0.5, 0, 0, 0, 0]), ("k_by", "c_by"))
+    assert not rivals(np.full(6, 1.2), PARAMETERS)  # nothing of a cause twice as large as itself is linear

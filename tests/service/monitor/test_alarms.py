@@ -292,6 +292,22 @@ def test_an_unbalance_has_low_confidence_while_both_stiffnesses_read_softer(
     assert {event.alarm.name: event.alarm.low_confidence for event in told} == {"e": reserve}
 
 
+def test_a_name_has_low_confidence_while_a_cause_outside_the_model_explains_the_data_as_well() -> None:
+    book, named = AlarmBook(SETTINGS), verdict({"e": 0.97, "c_by": 0.0}, change=0.9)
+    unnamed = named.model_copy(update={"changed": ()})
+    said = (named, ""), (named, "the disc's mass"), (named, "the disc's mass"), (unnamed, None), (named, "")
+    explains = [book.found(one, "", "", n * 5_000_000_000, rival=rival) for n, (one, rival) in enumerate(said)]
+    raised, escalated = book.take()
+    assert raised.alarm.low_confidence
+    assert raised.text.endswith("(low confidence: a change of the disc's mass explains the data as well)")
+    assert [raised.alarm.severity, escalated.alarm.severity] == [Severity.ALERT, Severity.DANGER]
+    assert explains == [True, False, False, False, True]
+    assert not escalated.alarm.low_confidence
+    # While nobody looks, what was found last holds.
+    (event,) = lasting(named.model_copy(update={"current": named.current[:1]}))
+    assert not event.alarm.low_confidence
+
+
 def test_a_named_alarm_gets_low_confidence_while_nothing_explains_the_machine() -> None:
     book, named = AlarmBook(SETTINGS), verdict({"c_bz": 0.97})
     unexplained = named.model_copy(update={"current": (), "candidates": (), "outside_model": True})
