@@ -108,10 +108,10 @@ class KnownMachineEvaluator(WindowEvaluator):
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         window, latest = settled(self._machine.title, window, newest)
-        window = self._without_drifted(window, newest)
         speed = self._speed(window)
         self._rotation.take(window)
         self._reversed = reversed_signs(window)
+        window = self._without_drifted(window, newest)
         window = window if self.directed else replace(window, directed=False)
         deciding = self._diagnose_window(window)
         if self._sense_open:
@@ -150,20 +150,25 @@ class KnownMachineEvaluator(WindowEvaluator):
         pairs = [one.states for one in self.drifts if len(one.states) > 1 and there.issuperset(one.states)]
         if newest is None or not pairs:
             return window
-        read: list[tuple[float, WindowStatistics, Diagnosis]] = []
-        for left_out in product(*(reversed(pair) for pair in pairs)):
-            part = newest[0].statistics(lost=tuple(sorted({*window.lost, *left_out})))
-            with suppress(EstimationError):
-                if part is not None:
-                    decided = self._decide(part, self._likelihood.apart)
-                    read.append((max(0.0, _misfit_z(decided)), part, decided))
-        least = min((misfit_z for misfit_z, _, _ in read), default=np.inf)
-        likely = [(part, one) for misfit_z, part, one in read if misfit_z <= least + _LEAST_MISFIT_DROP]
-        if np.isinf(least):
-            return window if not read else read[0][1]
-        changes = [np.nan_to_num(apart(likely[0][1], one)) for _, one in likely]
-        self._drift_error = np.mean([np.outer(change, change) for change in changes], axis=0)
-        return likely[0][0]
+        sliding, test = newest
+        choices = [tuple(sorted({*window.lost, *one})) for one in product(*(reversed(pair) for pair in pairs))]
+        left_out = choices[0]
+        # A window that straddles a change misfits without either; its newest hops then do not.
+        for hops in (None, *sorted(test.settings.short_hops)):
+            read: list[tuple[float, tuple[str, ...], Diagnosis]] = []
+            for lost in choices:
+                with suppress(EstimationError):
+                    if (part := sliding.statistics(hops, lost=lost)) is not None:
+                        decided = self._decide(replace(part, directed=self.directed), self._likelihood.apart)
+                        read.append((max(0.0, _misfit_z(decided)), lost, decided))
+            least = min((misfit_z for misfit_z, _, _ in read), default=np.inf)
+            if least <= _MOST_MISFIT_Z:
+                likely = [(lost, one) for misfit_z, lost, one in read if misfit_z <= least + _LEAST_MISFIT_DROP]
+                left_out = likely[0][0]
+                changes = [np.nan_to_num(apart(likely[0][1], one)) for _, one in likely]
+                self._drift_error = np.mean([np.outer(change, change) for change in changes], axis=0)
+                break
+        return sliding.statistics(lost=left_out) or window
 
     def _contradicts_assumed_angle(self, deciding: Diagnosis) -> bool:
         """Whether the first window with a readable 1x vector contradicts the assumed angle of the heavy spot.
