@@ -9,6 +9,7 @@ import numpy as np
 
 from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import Naming, implicated
 from models.diagnosis.verdict.calibration import agreements
@@ -135,6 +136,12 @@ class WindowEvaluator(ABC):
     """Whether the directions of vectors mean anything: the shaft angle has not jumped since the monitor was set up, and
     no window has contradicted an angle of the heavy spot that was assumed because the machine file gives none."""
 
+    drifts: tuple[SensorFault, ...] = ()
+    """Gains that have drifted a little, of the latest window."""
+
+    despite_drift: str = "with larger errors"
+    """How a machine is diagnosed if a gain has drifted, where it is."""
+
     by: str
     """Name of the diagnostician that decides."""
 
@@ -177,8 +184,9 @@ class WindowEvaluator(ABC):
         return ()
 
     def heard(self, findings: Sequence[SensorFault]) -> None:
-        """Take note of sensor faults: once the shaft angle has jumped, directions mean nothing any more."""
+        """Take note of gains that drifted; once the shaft angle has jumped, directions mean nothing any more."""
         self.directed &= ("theta", FaultKind.OFFSET) not in {(*one.states, one.kind) for one in findings}
+        self.drifts = tuple(filter(is_drift, findings))
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next evaluations depend on, as named arrays; empty if they are independent."""

@@ -20,7 +20,7 @@ from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.verdict.isolation import misfit_beside
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
-from models.diagnosis.verdict.stretch import determined, stretch_of, to_scale, with_shared_error
+from models.diagnosis.verdict.stretch import apart, determined, stretch_of, with_shared_error
 from models.diagnosis.window.moments import Plan, plan_for, states_of
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
@@ -84,7 +84,6 @@ class BaselineEvaluator(WindowEvaluator):
         self.by = self._baselines[0][1].by if self._baselines else _SHAPE
         self.takes_short = self._baselines != ()
         self._plan = plan_for(machine)
-        self._drifts: tuple[SensorFault, ...] = ()
 
     def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
         """Also despite gains that have drifted a little: readings are widened by them."""
@@ -94,11 +93,6 @@ class BaselineEvaluator(WindowEvaluator):
         """Whether a relation was learned between these states alone, see `WindowEvaluator`."""
         _ = plan
         return any(one.reads(left) for _, one in self._baselines)
-
-    def heard(self, findings: Sequence[SensorFault]) -> None:
-        """Also take note of gains that have drifted."""
-        super().heard(findings)
-        self._drifts = tuple(filter(is_drift, findings))
 
     def evaluate(self, window: WindowStatistics, newest: Newest | None = None) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
@@ -137,8 +131,8 @@ class BaselineEvaluator(WindowEvaluator):
         baseline = self._baseline_for(window)
         clear = (window.without_lines if self._lines else window).with_steady_rotation
         read = baseline.diagnose(clear)
-        if self._drifts:
-            wrong = [self._square_of(one, read, baseline, clear) for one in self._drifts]
+        if self.drifts:
+            wrong = [self._square_of(one, read, baseline, clear) for one in self.drifts]
             read = with_shared_error(read, np.diag(np.sum(wrong, axis=0)))
         return determined(read, window, self._length_s)
 
@@ -153,16 +147,12 @@ class BaselineEvaluator(WindowEvaluator):
         gain, unaffected = 1 + (drift.value or 0.0), self._plan.states_without(drift.states)
         planes = {state[0] for state in self._plan.states if state not in unaffected}
         kept = [self._plan.states.index(state) for state in window.states]
+        unread = [gain - 1 if name[-1] in {"e", *planes} else 0.0 for name in PARAMETERS]
         squares = np.zeros(len(PARAMETERS))
         for state, factor in zip(reversed(drift.states), (1 / gain, gain), strict=False):
-            changes = np.array([gain - 1 if name[-1] in {"e", *planes} else 0.0 for name in PARAMETERS])
             corrected = baseline.diagnose(window.turned(self._plan.gain(state, factor)[np.ix_(kept, kept)]))
-            values = {one.name: one.relative_change for one in corrected.evaluable}
-            for one in read.evaluable:
-                then, now = values.get(one.name), one.relative_change
-                if then is not None and now is not None:
-                    changes[PARAMETERS.index(one.name)] = to_scale(one.name, then) - to_scale(one.name, now)
-            squares += changes**2 / len(drift.states)
+            changes = apart(read, corrected)
+            squares += np.where(np.isnan(changes), unread, changes) ** 2 / len(drift.states)
         return squares
 
     def _newest(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -16,16 +17,19 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading, reversed_signs
+from models.diagnosis.sensors.disagreement import is_drift
+from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import beside
 from models.diagnosis.verdict.sequential import SequentialTest
-from models.diagnosis.verdict.stretch import determined, with_shared_error
+from models.diagnosis.verdict.stretch import apart, determined, with_shared_error
 from models.diagnosis.window.moments import STEADY, Plan
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
-from rotorwatch.records.windows import Equation, Opinion
+from models.signals.block import FloatArray
+from rotorwatch.records.windows import Equation, Opinion, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, opinion_of, settled
 
 _LIKELIHOOD, _EXPLAINED, _SENSE, _DIRECTED, _ROTATION = "likelihood", "explained_ns", "sense", "directed", "rotation"
@@ -42,6 +46,7 @@ _MOST_UNBALANCE_RATIO, _LEAST_STANDARD_ERRORS = 20.0, 3.0
 lost blade makes ten times the unbalance, millimetres in place of micrometres a thousand times."""
 _LEAST_MISFIT_TO_SPLIT = 4.0
 """Standard deviations of the misfit from which the short stretches of a window are tested on their own."""
+_MOST_DRIFTS = 2  # pairs of sensors one of which has drifted: every choice of those to leave out takes a fit
 
 
 class KnownMachineEvaluator(WindowEvaluator):
@@ -53,6 +58,7 @@ class KnownMachineEvaluator(WindowEvaluator):
 
     by = "likelihood"
     takes_short = True
+    despite_drift = "without one of them"
 
     def __init__(self, machine: Machine, bundle: Bundle | None, commissioned: Commissioned | None = None) -> None:
         identified = None if commissioned is None else commissioned.identified
@@ -71,6 +77,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         self._angle_unchecked = commissioned is None and not given
         self._tried_ns, self._tried_in_vain = 0, False  # end of the window on which the other sense was tried
         self._rotation = LatestRotation()
+        self._drift_error: FloatArray | None = None  # of the latest window, for `with_shared_error`
         self._reversed = ""  # why the latest window and its newest hops say nothing of the unbalance
         self._compare_with(machine)
 
@@ -83,6 +90,18 @@ class KnownMachineEvaluator(WindowEvaluator):
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
 
+    def spared(self, plan: Plan, findings: Sequence[SensorFault]) -> tuple[str, ...] | None:
+        """Also despite gains that have drifted a little: one sensor of each pair is left out, see `WindowEvaluator`."""
+        drifts = [one for one in findings if is_drift(one) and not set(one.states).issubset(plan.others)]
+        lost = super().spared(plan, [one for one in findings if one not in drifts])
+        if lost is None or not drifts:
+            return lost
+        named = {*lost, *implicated([one for one in drifts if len(one.states) == 1])}
+        pairs = [one.states for one in drifts if named.isdisjoint(one.states)]
+        left = plan.states_without({*named, *(first for first, _ in pairs)})
+        can = plan.angle_column is not None and len(pairs) <= _MOST_DRIFTS and self.suffices(left, plan)
+        return tuple(sorted(named)) if can else None
+
     def suffices(self, left: Sequence[str], plan: Plan) -> bool:
         """Whether most states are left, as the theory holds for any set of sensors; see `WindowEvaluator`."""
         return len(left) > len(plan.states) / 2
@@ -93,6 +112,7 @@ class KnownMachineEvaluator(WindowEvaluator):
         speed = self._speed(window)
         self._rotation.take(window)
         self._reversed = reversed_signs(window)
+        window = self._without_drifted(window, newest)
         window = window if self.directed else replace(window, directed=False)
         deciding = self._diagnose_window(window)
         if self._sense_open:
@@ -119,6 +139,37 @@ class KnownMachineEvaluator(WindowEvaluator):
             opinions.append(opinion_of(deciding, beside(deciding, diagnosis)))
         sense: Literal["", "opposite"] = "opposite" if self._machine.rotor.I2p_kg_m2 < 0 else ""
         return Evaluation(deciding, short, equations, tuple(opinions), speed, gyroscopic=sense)
+
+    def _without_drifted(self, window: WindowStatistics, newest: Newest | None) -> WindowStatistics:
+        """Leave out one of each two sensors that have come apart in gain: that without which the window misfits less.
+
+        If that does not tell, it is always the same one, and the mean square of what any other choice would change is
+        added to the errors.
+        """
+        self._drift_error = None
+        there = set() if newest is None else set(newest[0].plan.mounted).difference(window.lost)
+        pairs = [one.states for one in self.drifts if len(one.states) > 1 and there.issuperset(one.states)]
+        if newest is None or not pairs:
+            return window
+        sliding, test = newest
+        choices = [tuple(sorted({*window.lost, *one})) for one in product(*(reversed(pair) for pair in pairs))]
+        left_out = choices[0]
+        # A window that straddles a change misfits without either; its newest hops then do not.
+        for hops in (None, *sorted(test.settings.short_hops)):
+            read: list[tuple[float, tuple[str, ...], Diagnosis]] = []
+            for lost in choices:
+                with suppress(EstimationError):
+                    if (part := sliding.statistics(hops, lost=lost)) is not None:
+                        decided = self._decide(replace(part, directed=self.directed), self._likelihood.apart)
+                        read.append((max(0.0, _misfit_z(decided)), lost, decided))
+            least = min((misfit_z for misfit_z, _, _ in read), default=np.inf)
+            if least <= _MOST_MISFIT_Z:
+                likely = [(lost, one) for misfit_z, lost, one in read if misfit_z <= least + _LEAST_MISFIT_DROP]
+                left_out = likely[0][0]
+                changes = [np.nan_to_num(apart(likely[0][1], one)) for _, one in likely]
+                self._drift_error = np.mean([np.outer(change, change) for change in changes], axis=0)
+                break
+        return sliding.statistics(lost=left_out) or window
 
     def _contradicts_assumed_angle(self, deciding: Diagnosis) -> bool:
         """Whether the first window with a readable 1x vector contradicts the assumed angle of the heavy spot.
@@ -301,7 +352,9 @@ class KnownMachineEvaluator(WindowEvaluator):
             # Not on a commissioned machine: its levels are compared with the healthy 1x.
             misfit_z = max(stated.misfit_z, _LEAST_FOREIGN_MISFIT)
             stated = replace(stated, misfit_z=misfit_z, suspect=stated.suspect or vector.foreign)
-        return stated if self._shared is None else with_shared_error(stated, self._shared)
+        for shared in (self._shared, self._drift_error):
+            stated = stated if shared is None else with_shared_error(stated, shared)
+        return stated
 
 
 def _misfit_z(diagnosis: Diagnosis) -> float:

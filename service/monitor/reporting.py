@@ -86,8 +86,9 @@ class WindowReporter:
         start_ns, faulty = statistics.start_ns, implicated(findings)
         faulted = lost != () or not faulty.issubset(self._plan.others)
         if faulted and lost is not None and not (stood or skipped):
-            how = {True: "with larger errors", False: "without it"}
-            told = (f"{one.text}; the machine is diagnosed {how[is_drift(one)]}" for one in findings)
+            despite = self.evaluator.despite_drift
+            how = ("without it" if set(one.states).issubset(lost) or not is_drift(one) else despite for one in findings)
+            told = (f"{one.text}; the machine is diagnosed {by}" for one, by in zip(findings, how, strict=True))
             findings = tuple(one.model_copy(update={"text": text}) for one, text in zip(findings, told, strict=True))
         speed = None if "theta" in faulty else finite(statistics.speed_rad_s)
         self._alarms.suppress(None if speed is None else speed * _RPM, end_ns)

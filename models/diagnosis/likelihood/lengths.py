@@ -58,6 +58,12 @@ class LengthFits:
             fit.rivals(wanted=False)
         return self._window.rivals(wanted=wanted)
 
+    def apart(self, window: WindowStatistics) -> Diagnosis:
+        """Estimate the parameters of another window from where the last one ended; the next windows ignore it."""
+        fit = LikelihoodFit(self._machine, sized=self._sized)
+        fit.start_near(self._window, anew=True)
+        return fit.diagnose(window)
+
     def has_news(self, sliding: SlidingWindow, window: WindowStatistics, lengths: tuple[int, ...]) -> bool:
         """Whether the newest hops, at any of these lengths, may differ from the window or from the nominal machine.
 

@@ -223,6 +223,17 @@ def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis
     return replace(diagnosis, covariance=total, common=common, unbalance=unbalance, parameters=tuple(parameters))
 
 
+def apart(one: Diagnosis, other: Diagnosis) -> FloatArray:
+    """By how much two diagnoses differ in the scale of their errors, (6,); nan unless both have a reading."""
+    changes = {each.name: each.relative_change or 0.0 for each in other.evaluable}
+    differences = np.full(len(PARAMETERS), np.nan)
+    for each in one.evaluable:
+        if each.name in changes:
+            there, here = to_scale(each.name, changes[each.name]), to_scale(each.name, each.relative_change or 0.0)
+            differences[PARAMETERS.index(each.name)] = there - here
+    return differences
+
+
 def _stated(
     name: str, diagnosis: Diagnosis, reading: Parameter | None, window: WindowStatistics, vague: float
 ) -> Parameter:

@@ -1,21 +1,24 @@
 """A machine with known parameters is diagnosed without its dead sensors."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from models.commissioning.commissioned import Installed, install
 from models.diagnosis.window.moments import plan_for
+from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, parse_fault
-from tests.commissioning.rotor_kit import commissioned, recording
+from tests.commissioning.rotor_kit import commissioned, recording, with_sensors
 from tests.service.rig.live import LAB, scenario_blocks
 from tests.service.rig.watching import feed, raised, resumed
+from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})})
 DEAD_S, CHANGE_S, END_S = 40.0, 70.0, 110.0
@@ -87,14 +90,59 @@ def test_a_dead_sensor_is_not_a_suspect_for_a_misfit() -> None:
     assert not any(suspect.startswith("y1 ") for suspect in suspects)
 
 
+@cache
+def identified() -> Installed:
+    return Installed(KIT, None, commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:700])).commissioned)
+
+
 def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
-    healthy = recording(KIT, scenario_blocks(END_S)[:700])
-    made = commissioned(KIT, healthy).commissioned
-    monitor = MachineMonitor(Installed(KIT, None, made))
+    monitor = MachineMonitor(identified())
     reports, _ = feed(monitor, dying([1], np.nan))
     assert {one.state for one in reports[-6:]} == {HealthState.DATA_HEALTH}
     assert raised(monitor) == {"data-missing"}
     assert [one.name for one in reports[-1].parameters if one.relative_change is not None] == list(PARAMETERS)
+
+
+def drifted(stream: Sequence[SampleBlock], machine: MachineFile, **gains: float) -> list[SampleBlock]:
+    factors = np.array([gains.get(sensor.name, 1.0) for sensor in machine.sensors], dtype=np.float32)
+    return [replace(block, samples=block.samples * factors) for block in stream]
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [
+        {"y1": 1.03},
+        *(pytest.param(one, marks=pytest.mark.long) for one in ({"y1_dot": 0.97}, {"y2": 0.96, "z1_dot": 0.96})),
+    ],
+)
+def test_a_change_is_named_although_a_gain_has_drifted(gains: dict[str, float]) -> None:
+    """Without the one of two sensors that has drifted, the theory explains the window."""
+    monitor = MachineMonitor(identified(), remembered=True)
+    stream = drifted(scenario_blocks(END_S, parse_fault(f"k_by=-0.2@{CHANGE_S}")), KIT, **gains)
+    reports, _ = feed(monitor, stream[:695])
+    full = [one for one in reports if one.filled == 1]
+    assert {one.state for one in full} == {HealthState.DATA_HEALTH}
+    assert all("is diagnosed without " in fault.text for one in full for fault in one.sensors)
+    again = resumed(monitor, identified(), remembered=True)
+    (reports, _), (same, _) = feed(monitor, stream[695:]), feed(again, stream[695:])
+    assert same == reports
+    assert raised(monitor) == {"data-gain", "k_by"}
+    for reading in reports[-1].parameters:
+        change = sure(reading.relative_change) + 0.2 * (reading.name == "k_by")
+        assert abs(change) < 4 * sure(reading.standard_error) < 0.1
+
+
+def test_errors_are_larger_where_the_theory_does_not_tell_which_gain_has_drifted() -> None:
+    """At the bearing alone, a gain of both sensors in one plane reads as forces, and an unbalance, of another size."""
+    machine, healthy = with_sensors(KIT, scenario_blocks(END_S)[:700], lambda sensor: sensor.location != "disc")
+    installed = Installed(machine, None, commissioned(machine, recording(machine, healthy)).commissioned)
+    read = []
+    for gain in (1.0, 1.05):
+        reports, _ = feed(monitor := MachineMonitor(installed), drifted(healthy[:450], machine, y1=gain))
+        assert raised(monitor) == ({"data-gain"} if gain > 1 else set())
+        read.append(next(one for one in reports[-1].parameters if one.name == "e"))
+    (before, plain), (now, wide) = ((sure(one.relative_change), sure(one.standard_error)) for one in read)
+    assert 0.01 < abs(now - before) < 2 * (wide**2 - plain**2) ** 0.5
 
 
 def test_without_one_of_two_angled_probes_both_planes_are_left_out() -> None:
