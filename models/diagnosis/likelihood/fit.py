@@ -69,7 +69,7 @@ _Band = tuple[FloatArray, npt.NDArray[np.bool_]]
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
-    The state kept between windows is the starting point, the strength of the pull on the forces' colours, and, if
+    The state kept between windows is the starting point, the strengths of the pulls on the forces' colours, and, if
     `follow`, the slopes of the last search, with which windows that differ little are followed without a new search.
     Consecutive windows must overlap for that. If `sized`, the size of e is read without a phase reference, too.
     """
@@ -82,7 +82,7 @@ class LikelihoodFit:
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._follow = follow
         self._last: FloatArray | None = None
-        self._strength: float | None = None
+        self._strengths: FloatArray | None = None
         self._line: Linearised | None = None
         self._line_segments = self._followed = self._misfits = 0
         self._corners = 1  # of the sensor noise's colour
@@ -94,20 +94,20 @@ class LikelihoodFit:
 
     def reset(self) -> None:
         """Start the next window cold."""
-        self._last = self._strength = self._line = None
+        self._last = self._strengths = self._line = None
         self._misfits = 0
 
     def start_near(self, other: "LikelihoodFit", *, anew: bool) -> None:
         """Start the next window where another fit of the same machine has ended: `anew`, or if the noise is another."""
         if anew or self._corners != other._corners:
-            self._last, self._strength, self._line = other._last, other._strength, None
+            self._last, self._strengths, self._line = other._last, other._strengths, None
             self._corners = other._corners
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""
         found: dict[str, np.ndarray] = {
             "last": np.array([] if self._last is None else self._last, dtype=np.float64),
-            "strength": np.array([] if self._strength is None else [self._strength], dtype=np.float64),
+            "strengths": np.full(2, np.nan) if self._strengths is None else self._strengths,
             "followed": np.array([self._line_segments, self._followed, self._misfits, self._corners], dtype=np.int64),
         }
         line = self._line
@@ -118,7 +118,7 @@ class LikelihoodFit:
                 "states": np.array(line.model.motions.states, dtype=np.str_),
                 "scale": line.model.motions.scale,
                 "force_scale": np.array(line.model.force_unit[0], dtype=np.float64),
-                "line_strength": np.array(line.weights.strength, dtype=np.float64),
+                "line_strengths": line.weights.strengths,
                 "frequencies_hz": frequencies_hz,
                 "excluded": excluded,
             }
@@ -126,7 +126,8 @@ class LikelihoodFit:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue where `checkpoint` was called, with the same bits; what raises has changed nothing."""
-        last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
+        last = checked(arrays, "last", np.float64, (None,))
+        strengths = checked(arrays, "strengths", np.float64, (2,))
         segments, followed, misfits, corners = checked(arrays, "followed", np.int64, (4,)).tolist()
         line = band = None
         if "states" in arrays:
@@ -138,7 +139,7 @@ class LikelihoodFit:
             except np.linalg.LinAlgError as error:
                 raise CheckpointError(f"{self._machine.name}: the remembered maximum makes no valid spectra") from error
         self._last = last if last.size else None
-        self._strength = float(strength[0]) if strength.size else None
+        self._strengths = strengths if np.all(np.isfinite(strengths)) else None
         self._line, self._line_band, self._line_segments = line, band, segments
         self._followed, self._misfits, self._corners = followed, misfits, corners
 
@@ -155,8 +156,8 @@ class LikelihoodFit:
         speeds = 2 if checked(line, "speeds_rad_s", np.float64, (None,)).size > 3 else 1
         groups = self._grouped(band, speeds)
         model = SpectralModel(self._machine, motions, groups, force_scale, corners=corners)
-        strength = float(checked(arrays, "line_strength", np.float64, ()))
-        return Linearised.restored(model, Weights(model, segments, self._usual_cutoff_hz, strength), line)
+        strengths = checked(arrays, "line_strengths", np.float64, (2,))
+        return Linearised.restored(model, Weights(model, segments, self._usual_cutoff_hz, strengths), line)
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
@@ -213,7 +214,7 @@ class LikelihoodFit:
             raise UnexplainedError(
                 f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
             ) from error
-        self._last, self._strength = found.theta, weights.strength
+        self._last, self._strengths = found.theta, weights.strengths
         why, nowhere = unexplained_at(model, weights, found.whitened, states)
         unexplained = self._stated(why)
         if nowhere:
@@ -372,7 +373,7 @@ class LikelihoodFit:
                 self._line = line
                 return line.model, line.weights, found
             # The units stay the same, and the first step uses the derivatives where the last search ended.
-            model, search = line.model, self._search(line.model, window, speed, self._strength)
+            model, search = line.model, self._search(line.model, window, speed, self._strengths)
             with suppress(np.linalg.LinAlgError):  # unless that makes no valid spectrum for this window
                 found = search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
         if found is None:
@@ -415,7 +416,7 @@ class LikelihoodFit:
         motions = Motions(window.states, scale)
         force_scale = usual_force(self._machine, motions, groups, speed, self._usual_cutoff_hz)
         model = SpectralModel(self._machine, motions, groups, force_scale, corners=self._corners)
-        search = self._search(model, window, speed, self._strength)
+        search = self._search(model, window, speed, self._strengths)
         if self._last is not None and self._last.size == model.size:
             try:
                 return model, search, search.maximise(self._last, _WARM_STEPS, _NEAR, _GAIN)
@@ -437,10 +438,10 @@ class LikelihoodFit:
         return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN, hopeless=is_hopeless)
 
     def _search(
-        self, model: SpectralModel, window: WindowStatistics, speed: Speeds, strength: float | None = None
+        self, model: SpectralModel, window: WindowStatistics, speed: Speeds, strengths: FloatArray | None = None
     ) -> FisherScoring:
         observed = _observed(model, window)
-        return FisherScoring(model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength)
+        return FisherScoring(model, observed, window.n_segments, speed, self._usual_cutoff_hz, strengths)
 
     def _grouped(self, band: _Band, speeds: int, coarser: float = 1.0) -> BinGroups:
         """Groups for a band, remembered while the speed stays in the same bin."""

@@ -16,10 +16,11 @@ LOG_NOISE = float(np.log(1e-3))
 # rank, or a channel without visible noise, leaves them undetermined.
 _WEAK = 0.05
 _COLOUR = 1.0  # the same for the noise's colour
-# Strengths with which the forces' own colours may be pulled towards none. The evidence of the window selects one (D. J.
-# C. MacKay, Neural Computation 4 (1992)), so forces of one colour cost next to nothing, and a hump is not suppressed.
+# Strengths with which the forces' colours may be pulled towards none. The evidence of the window selects one (D. J. C.
+# MacKay, Neural Computation 4 (1992)) for the colour that all forces share and one for their differences, so forces of
+# one low-pass cost next to nothing, and a hump is not suppressed.
 _STRENGTHS = np.geomspace(0.5, 2000, 24)
-# How often a search re-estimates the strength, and the change of its logarithm that is not worth more steps.
+# How often a search re-estimates the strengths, and the change of their logarithms that is not worth more steps.
 _LOOKS, _SAME_STRENGTH = 3, 0.5
 # Pulls on the low-pass: the logarithms of cutoff and order have standard deviations of 1 and 0.3. A model without
 # colours of the forces keeps the order fixed: on coarse groups a filter of order near zero would fit anything.
@@ -71,11 +72,12 @@ class Weights:
     """Weight of a window's data, and of the pulls towards usual values for what the data leave undetermined.
 
     Estimated spectra are means of `n_segments` segments. The cutoff is pulled weakly to the usual one, in case the band
-    does not show it; `strength` pulls the forces' own colours towards none, by default the weakest.
+    does not show it; `strengths` pull the forces' colours (the common one, their differences) towards none, by default
+    as weakly as possible.
     """
 
     def __init__(
-        self, model: SpectralModel, n_segments: int, usual_cutoff_hz: float, strength: float | None = None
+        self, model: SpectralModel, n_segments: int, usual_cutoff_hz: float, strengths: FloatArray | None = None
     ) -> None:
         self._level_at = model.level_at
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
@@ -85,8 +87,10 @@ class Weights:
             if not np.any(model.motions.dofs // 3 == plane):
                 self.ridge[own] = _UNSHOWN
         self.ridge[model.colour_at] = _COLOUR
-        self.strength = float(_STRENGTHS[0]) if strength is None else strength
-        self.ridge[model.shape_at] = self.strength
+        self.colours = model.common_at, model.own_at
+        self.strengths = np.full(2, _STRENGTHS[0]) if strengths is None else strengths.copy()
+        for at, own in zip(self.colours, self.strengths, strict=True):
+            self.ridge[at] = own
         self.ridge[model.cutoff_at] = _CUTOFF
         self.ridge[model.order_at] = _ORDER if model.shapes else _FIXED
         self.centre = np.zeros(model.size)
@@ -108,7 +112,7 @@ class FisherScoring:
     The levels are stepped as T of C = T Tᵀ. Where the data call for less excitation in a direction, the curvature of
     T Tᵀ is added to the information; without it the small columns of a low-rank excitation overshoot and hold up every
     other parameter. `observed`, the estimated cross-spectra, shape (n_groups, n, n), are in the model's units. The
-    `strength` (see `Weights`) applies until it is re-estimated from the window.
+    `strengths` (see `Weights`) apply until they are re-estimated from the window.
     """
 
     def __init__(
@@ -118,10 +122,10 @@ class FisherScoring:
         n_segments: int,
         speed_rad_s: Speeds,
         usual_cutoff_hz: float,
-        strength: float | None = None,
+        strengths: FloatArray | None = None,
     ) -> None:
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
-        self.weights = Weights(model, n_segments, usual_cutoff_hz, strength)
+        self.weights = Weights(model, n_segments, usual_cutoff_hz, strengths)
         shape = (model.size, model.groups.bins.size, model.n * model.n)
         self._slopes, self._weighted = np.empty(shape), np.empty(shape)  # filled by every step
 
@@ -154,7 +158,7 @@ class FisherScoring:
             if steps == most_steps or damping > 1e8 or (hopeless is not None and hopeless(steps, whitened)):
                 break
             if is_near and gradient @ full_step / 2 < gain:
-                if not model.shapes or looks == _LOOKS or not self._learn_strength(theta, covariance):
+                if not model.shapes or looks == _LOOKS or not self._learn_strengths(theta, covariance):
                     break
                 looks += 1
                 value, whitened = self._value(theta)
@@ -176,21 +180,24 @@ class FisherScoring:
         reached = Derivatives(slopes, on_levels - np.diag(self.weights.pull), slopes_rad_s)
         return Maximum(on_levels, reached, whitened, steps, fitted, full_step[diagnosed])
 
-    def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
-        """Set the strength that has the largest evidence for the colours found; False if it hardly changed.
+    def _learn_strengths(self, theta: FloatArray, covariance: FloatArray) -> bool:
+        """Set the strengths that have the largest evidence for the colours found; False if they hardly changed.
 
         Around the current maximum the profile log-likelihood of the colours is quadratic, so the evidence of every
         strength has a closed form.
         """
-        at, old = self._model.shape_at, self.weights.strength
-        precision = np.linalg.inv(covariance[at, at])
-        eigenvalues, vectors = np.linalg.eigh(precision)
-        left = np.maximum(eigenvalues - old, 0)[:, None] + _STRENGTHS
-        slope = vectors.T @ (precision @ theta[at])
-        evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
-        new = float(_STRENGTHS[np.argmax(evidence)])
-        self.weights.strength = self.weights.ridge[at] = new
-        return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
+        weights, changed = self.weights, False
+        for number, at in enumerate(weights.colours):
+            old = weights.strengths[number]
+            precision = np.linalg.inv(covariance[at, at])
+            eigenvalues, vectors = np.linalg.eigh(precision)
+            left = np.maximum(eigenvalues - old, 0)[:, None] + _STRENGTHS
+            slope = vectors.T @ (precision @ theta[at])
+            evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
+            new = _STRENGTHS[np.argmax(evidence)]
+            weights.strengths[number] = weights.ridge[at] = new
+            changed |= bool(abs(np.log(new / old)) > _SAME_STRENGTH)
+        return changed
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
         """Log-likelihood with the weak pulls, up to a constant, and the whitened spectra."""

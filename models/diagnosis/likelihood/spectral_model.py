@@ -6,11 +6,11 @@ The cross-spectral matrix of the measured motions (displacement and velocity of 
     S(f) = c(f; fc) · G D(f) C D(f) Gᴴ + diag(d(f)),   G = H at the measured rows, in the motions' units,
 
 with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a low-pass of unknown cutoff and order, C an
-unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) the own colour of each
-degree of freedom's force, with polynomials b_j in √f. The excitation may thus be one source in any direction or many,
-of first or fourth order, each with its own cutoff or with a broad hump; only a smooth spectrum is assumed. The spectra
-are the Fourier transforms of the correlation functions of Eq. (18): this is the comparison of theoretical and estimated
-correlations with the right weight on every lag.
+unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) the colour of each
+degree of freedom's force, with polynomials b_j in √f: a fine one that all forces share, and coarser differences. The
+excitation may thus be one source in any direction or many, of first or fourth order, each with its own cutoff or with a
+hump; only a smooth spectrum is assumed. The spectra are the Fourier transforms of the correlation functions of Eq.
+(18): this is the comparison of theoretical and estimated correlations with the right weight on every lag.
 
 C = T Tᵀ with T lower triangular, so that every point the search tries is a possible excitation. Standard errors come
 from the information on C itself, which stays right where T loses rank (decision 0002).
@@ -27,6 +27,7 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import helmert
 from scipy.special import eval_legendre
 
 from models.diagnosis.likelihood.motions import BinGroups, Motions
@@ -47,7 +48,9 @@ those at a mixture of speeds are not, which would pass for a misfit.
 CORNERS = 3  # of the noise's colour, where one does not suffice
 _APART = 4.0  # ratio of each corner to the next
 _GRID = 100  # frequencies over which their functions are made orthonormal
-SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
+# Polynomials in √f for the colour that all forces share, and for the difference of each one's own from it.
+COMMON, SHAPES = 24, 8
+_OWN = helmert(6)  # orthonormal differences of six forces, shape (5, 6)
 ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
 IDENTITY = np.eye(6)[ROWS, COLUMNS]  # equal independent sources of level one
 _BEARING_DOFS = (0, 0, 3, 3)
@@ -90,7 +93,8 @@ class SpectralModel:
 
     The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithms of the low-pass's
     cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
-    Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
+    Hz), their exponents b, the coefficients of the forces' colours (of that which all share, over √6, then of their
+    orthonormal differences polynomial by polynomial), and the lower triangle of T.
 
     The motions are in units that make all spectra of order one, and forces in `force_scale`, N/√Hz, which does the same
     for the elements of C. Without polynomials for the forces' colour (`shapes` = 0), all forces share one low-pass.
@@ -116,8 +120,9 @@ class SpectralModel:
         self.order_at = self.cutoff_at + 1
         self.noise_at = slice(self.order_at + 1, self.order_at + 1 + len(motions.states))
         self.colour_at = slice(self.noise_at.stop, self.noise_at.stop + corners * self.n)
-        self.shape_at = slice(self.colour_at.stop, self.colour_at.stop + 6 * shapes)
-        self.level_at = slice(self.shape_at.stop, self.shape_at.stop + ROWS.size)
+        self.common_at = slice(self.colour_at.stop, self.colour_at.stop + (COMMON if shapes else 0))
+        self.own_at = slice(self.common_at.stop, self.common_at.stop + 5 * shapes)
+        self.level_at = slice(self.own_at.stop, self.own_at.stop + ROWS.size)
         self.size = self.level_at.stop
         self._see(groups)
 
@@ -133,7 +138,7 @@ class SpectralModel:
         self._noise_shapes = _noise_shapes(groups.centre_hz, low, high, self.corners)
         # In √f the polynomials resolve a low-pass at the lower end as well as a hump at the upper end.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
-        self._b = eval_legendre(np.arange(1, self.shapes + 1), x[:, None])
+        self._b = eval_legendre(np.arange(1, (COMMON if self.shapes else 0) + 1), x[:, None])
         self._w = 2 * np.pi * groups.nodes_hz
         # Neighbouring groups share nodes and are padded to equal numbers: with light damping half are duplicates.
         self._distinct_w, place = np.unique(self._w, return_inverse=True)
@@ -212,7 +217,8 @@ class SpectralModel:
         """
         speeds = speed_rad_s if isinstance(speed_rad_s, tuple) else (speed_rad_s,)
         H = np.concatenate([self.receptance(theta[: self.cutoff_at], one, self._distinct_w) for one in speeds])
-        colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
+        own = self._b[:, : self.shapes] @ theta[self.own_at].reshape(self.shapes, 5) @ _OWN
+        colour = np.exp(0.5 * ((self._b @ theta[self.common_at])[:, None] / np.sqrt(6) + own))
         unit = self.force_unit * colour[:, None, None, :]
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
         G = H[:, self.motions.dofs][self._place]
@@ -287,8 +293,10 @@ class SpectralModel:
         np.multiply(shaped.transpose(1, 2, 0)[..., None], densities, out=of_colours)
         left, right = (side.transpose(3, 0, 2, 1) for side in (whitened, response.conj()))  # of every force
         by_force = twice_packed(np.asarray(left @ right.swapaxes(2, 3))) / 2
-        of_shapes = out[self.shape_at].reshape(self.shapes, 6, *out.shape[1:])
-        np.multiply(self._b.T[:, None, :, None], by_force, out=of_shapes)
+        b = self._b.T[:, :, None]
+        np.multiply(b, by_force.sum(axis=0) / np.sqrt(6), out=out[self.common_at])
+        of_own = out[self.own_at].reshape(self.shapes, 5, *out.shape[1:])
+        np.multiply(b[: self.shapes, None], np.tensordot(_OWN, by_force, axes=1), out=of_own)
         columns = whitened.transpose(0, 2, 3, 1).reshape(len(whitened), self.n * 6, -1)
         pairs = (columns @ columns.conj().swapaxes(1, 2)).reshape(-1, self.n, 6, self.n, 6)[:, :, ROWS, :, COLUMNS]
         out[self.level_at] = twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]

@@ -215,6 +215,19 @@ def test_noise_that_falls_from_the_bands_lower_end_is_within_the_model(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("name", "number", "hump_hz"), [("heavy", 0, 18.6), ("light", 2, 27.5)])
+def test_a_narrow_hump_of_the_forces_beside_a_mode_is_within_the_model(name: str, number: int, hump_hz: float) -> None:
+    """With eight polynomials for every force, k_by of *heavy* is 9 standard errors off, and *light* misfits by 27."""
+    machine = load_machine(name)
+    drawn = draw_condition(Draw(machine, 778031, Purpose.EVALUATION, 33, layout=Layout.INDEPENDENT), number)
+    hump = {"hump_share": 0.4, "hump_hz": hump_hz, "hump_damping": 0.1}
+    scenario = drawn.model_copy(update={"sources": tuple(one.model_copy(update=hump) for one in drawn.sources)})
+    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(scenario, machine))
+    assert sure(diagnosis.misfit_z) < 4
+    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
+
+
+@pytest.mark.slow
 def test_a_wrong_gain_and_an_added_mass_cause_a_misfit() -> None:
     gain = UnusualDraw(LAB, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
     diagnosis = LikelihoodFit(LAB).diagnose(simulate_window(gain, 0))
