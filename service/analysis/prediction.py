@@ -127,7 +127,7 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     force_scale = usual_force(machine, motions, groups, speed, usual_cutoff_hz)
     model = SpectralModel(machine, motions, groups, force_scale)
     observed = model.observed(groups.average(window.spectrum))
-    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _COLOUR_RIDGE)
+    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, np.full(2, _COLOUR_RIDGE))
     search.weights.ridge[: model.cutoff_at] = _FIXING_RIDGE
     try:
         # Trial points may overflow: the result is checked below, so no warnings are needed.

@@ -70,7 +70,7 @@ def test_after_windows_that_misfit_a_better_maximum_is_searched_from_scratch() -
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT, faults={"c_bz": -0.3})
     window, fit = simulate_window(draw, 0), LikelihoodFit(LAB)
     right, remembered = fit.diagnose(window), fit.checkpoint()
-    remembered["last"][:5] += [0.5, -0.5, -1.5, 0.2, 0.1]
+    remembered["last"][4] += 0.8
     found = []
     for followed, misfits in ((0, 0), (0, 3), (12, 0)):
         remembered["followed"][1:3] = followed, misfits

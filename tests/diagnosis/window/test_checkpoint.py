@@ -156,7 +156,7 @@ def test_slopes_kept_from_an_earlier_search_are_restored_at_its_speed() -> None:
     fit = LikelihoodFit(LAB, follow=True)
     fit.diagnose(first)
     line = sure(fit._line)
-    search = fit._search(line.model, second, second.speed_rad_s, line.weights.strength)
+    search = fit._search(line.model, second, second.speed_rad_s, line.weights.strengths)
     found = search.maximise(line.theta, 0, 0.15, 3.0, line.derivatives)
     assert found.derivatives.speed_rad_s == first.speed_rad_s != second.speed_rad_s
     moved = Linearised.around(line.model, search.weights, found)
