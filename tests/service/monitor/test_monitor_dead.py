@@ -140,7 +140,7 @@ def test_errors_are_larger_where_the_theory_does_not_tell_which_gain_has_drifted
     for gain in (1.0, 1.05):
         reports, _ = feed(monitor := MachineMonitor(installed), drifted(healthy[:450], machine, y1=gain))
         assert raised(monitor) == ({"data-gain"} if gain > 1 else set())
-        read.append(next(one for one in reports[-1].parameters if one.name == "e"))
+        read.append(next(one for one in reports[-2].parameters if one.name == "e"))
     (before, plain), (now, wide) = ((sure(one.relative_change), sure(one.standard_error)) for one in read)
     assert 0.01 < abs(now - before) < 2 * (wide**2 - plain**2) ** 0.5
 
