@@ -41,6 +41,7 @@ _LEAST_CHANGES_UNNAMED = 4
 """Outside the model, number of apparently changed parameters from which none is named: it is another machine, or what
 is wrong concerns all of it."""
 _HELD_STIFF_NOTE = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
+_VANISHED, _VANISHED_NOTE = -0.9, "its 1x has all but vanished; the sensors may no longer see this shaft"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +148,9 @@ class AlarmBook:
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
                 larger = reading.relative_change if reading.vector is None else reading.vector.magnitude_change
-                # No fault of a shaft makes it stiffer.
-                held_stiff = reading.name == "EI" and larger > Z95 * reading.standard_error
-                if held_stiff:
-                    unreserved.discard("EI")
+                unlikely = _unlikely(reading.name, larger, reading.standard_error)
+                if unlikely:
+                    unreserved.discard(reading.name)
                 self.update(
                     reading.name,
                     reading.relative_change,
@@ -160,12 +160,12 @@ class AlarmBook:
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
                     low_confidence=outside
                     or hidden
-                    or held_stiff
+                    or unlikely != ""
                     or (unlike and (reading.name, reading.by) == ("e", BaselineDiagnostician.by)),
                     rival=rival if reading.name in named else None,
                     growth=larger if reading.name == "e" else None,
                     evidence=evidence,
-                    note=_HELD_STIFF_NOTE if held_stiff else "" if reading.vector is None else reading.vector.text,
+                    note=unlikely or ("" if reading.vector is None else reading.vector.text),
                 )
         if outside and not verdict.current:
             # Nothing is read from unexplained data, and parameters named before are named with reserve from now on.
@@ -479,3 +479,10 @@ class AlarmBook:
         self._alarms[alarm.name] = alarm
         self._pending_events.append(event)
         return (event,)
+
+
+def _unlikely(name: str, change: float, error: float) -> str:
+    """Why no fault of the machine changes a parameter like that; empty if one may."""
+    if name == "EI" and change > Z95 * error:
+        return _HELD_STIFF_NOTE
+    return _VANISHED_NOTE if name == "e" and change < _VANISHED else ""

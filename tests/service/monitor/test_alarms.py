@@ -230,7 +230,15 @@ def test_a_stiffer_shaft_has_low_confidence_and_a_smaller_unbalance_is_no_danger
     assert event.alarm.low_confidence
     assert "locked coupling" in event.text
     for change, severity in ((0.9, Severity.DANGER), (-0.9, Severity.ALERT)):
-        assert [event.alarm.severity for event in lasting(verdict({"e": 0.99}, change=change))] == [severity]
+        (event,) = lasting(verdict({"e": 0.99}, change=change))
+        assert (event.alarm.severity, event.alarm.low_confidence) == (severity, False)
+
+
+def test_an_unbalance_that_has_vanished_has_low_confidence() -> None:
+    """As where noise has taken the place of every signal."""
+    (event,) = lasting(verdict({"e": 0.99}, change=-0.95))
+    assert event.alarm.low_confidence
+    assert "no longer see this shaft" in event.text
 
 
 def test_stiffening_or_small_changes_explain_no_levels_and_a_repaired_shaft_clears() -> None:
