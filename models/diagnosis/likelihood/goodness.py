@@ -40,19 +40,11 @@ def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, stat
     displacement and velocity are also compared with each other.
     """
     names, slopes = _alternatives(model, found)
-    seen = packed(found.whitened.excess)
-    weight = weights.averages[:, None]
-    flat = found.derivatives.slopes.reshape(model.size, -1)
-    weighted = (slopes * weight).reshape(len(names), -1)
-    cross = weighted @ flat.T
-    projection = np.linalg.solve(found.information, cross.T).T
-    score = weighted @ seen.ravel() - projection @ (flat @ (seen * weight).ravel())
-    alone = np.einsum("af,af->a", weighted, slopes.reshape(len(names), -1))
-    left = alone - np.einsum("ap,ap->a", projection, cross)
+    score, left, told, _ = beyond_parameters(model, weights, found, slopes)
     alternatives = tuple(
         AlternativeTest(name, float(s / np.sqrt(i)), float(s / i))
-        for name, s, i, a in zip(names, score, left, alone, strict=True)
-        if i > _LEAST_INFORMATION * a
+        for name, s, i, sure in zip(names, score, left, told, strict=True)
+        if sure
     )
     mismatches = model.motions.mismatches(states, model.centre, weights.averages)
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
@@ -65,6 +57,25 @@ def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, stat
     over = total - (model.n**2 * float(np.trace(shared)) - found.fitted)
     scatter = float(model.n * np.sqrt(2 * np.sum(shared**2)))
     return Goodness(over / scatter, (*alternatives, *pairs), tests, over)
+
+
+def beyond_parameters(
+    model: SpectralModel, weights: Weights, found: Maximum, slopes: FloatArray
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], FloatArray]:
+    """What the model's parameters leave of deviations with these packed slopes, (n_deviations, n_groups, n²).
+
+    These are the scores and the information on the deviations, each (n_deviations,); whether that information is more
+    than rounding; and the changes of parameters that imitate the deviations, (n_deviations, size).
+    """
+    seen, weight = packed(found.whitened.excess), weights.averages[:, None]
+    flat = found.derivatives.slopes.reshape(model.size, -1)
+    weighted = (slopes * weight).reshape(len(slopes), -1)
+    cross = weighted @ flat.T
+    imitated = np.asarray(np.linalg.solve(found.information, cross.T).T, dtype=np.float64)
+    score = weighted @ seen.ravel() - imitated @ (flat @ (seen * weight).ravel())
+    alone = np.einsum("af,af->a", weighted, slopes.reshape(len(slopes), -1))
+    left = alone - np.einsum("ap,ap->a", imitated, cross)
+    return score, left, left > _LEAST_INFORMATION * alone, imitated
 
 
 def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> AlternativeTest:

@@ -11,8 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from models.diagnosis.likelihood.goodness import beyond_parameters
 from models.diagnosis.likelihood.scoring import Maximum, Weights
-from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Sides, SpectralModel, packed
+from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Sides, SpectralModel
 from models.diagnosis.likelihood.unbalance import around_rotation, parts
 from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import UnbalanceVector
@@ -27,8 +28,6 @@ _Term = tuple[FloatArray, Callable[[FloatArray], ComplexArray]]
 # lighter damping would resolve a resonance that no one knows the place of.
 _FOUNDATIONS, _FOUNDATION_DAMPING = (2.0, 2.8, 4.0, math.inf), 0.2
 _AT_BEARING = [0, 3]
-# Least share of a cause's information that parameters leave; with less, its score is rounding.
-_LEAST_INFORMATION = 1e-4
 
 
 def rivals_at(
@@ -49,18 +48,11 @@ def rivals_at(
     causes = _causes(model, point.theta, speed_rad_s)
     w = 2 * np.pi * model.groups.nodes_hz
     slopes = np.stack([sum(sides.slope(-by(w), change=matrix.T) for matrix, by in terms) for _, terms in causes])
-    flat, weight = found.derivatives.slopes.reshape(model.size, -1), weights.averages[:, None]
-    weighted, seen = (slopes * weight).reshape(len(causes), -1), packed(found.whitened.excess)
-    cross = weighted @ flat.T
-    imitated = np.linalg.solve(found.information, cross.T).T
-    score = weighted @ seen.ravel() - imitated @ (flat @ (seen * weight).ravel())
-    alone = np.einsum("af,af->a", weighted, slopes.reshape(len(causes), -1))
-    left = alone - np.einsum("ap,ap->a", imitated, cross)
-    known = left > _LEAST_INFORMATION * alone
+    score, left, known, imitated = beyond_parameters(model, weights, found, slopes)
     at_speed = np.array(
         [sum(matrix * by(np.array([speed_rad_s])) for matrix, by in terms) for _, terms in causes], dtype=np.complex128
     )
-    own: FloatArray = np.asarray(imitated[:, : len(STRUCTURAL)], dtype=np.float64)
+    own = imitated[:, : len(STRUCTURAL)]
     read = np.zeros((len(causes), len(PARAMETERS)))
     read[:, [PARAMETERS.index(name) for name in STRUCTURAL]] = own
     read[:, PARAMETERS.index("e")] = _as_unbalance(
