@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.missing import no_data
+from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.window.moments import Plan, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.errors import RotorwatchError
@@ -66,7 +68,8 @@ def recorded_window(
         )
     window = SlidingWindow(plan)
     newest: Excerpt | None = None
-    lost = LatestData(sensors=() if report is None else report.sensors).missing
+    known = () if report is None else report.sensors
+    lost = implicated(one for one in known if one.kind is FaultKind.MISSING)
     sent = [one for one in data.sent(channels) if state_name(one) not in lost]
     for stretch in data.stretches(sent):
         part = _between(stretch, first_ns, end_ns)
@@ -77,13 +80,18 @@ def recorded_window(
         newest = replace(part, samples=whole)
         window.gap()
         deque(window.feed(plan.to_si(np.nan_to_num(whole)), part.start_ns), maxlen=0)
+    judged = window.again()
+    found = None if judged is None else judged()
+    if report is None:
+        known = tuple(_missing(one) for one in channels if one not in sent)
+        known = known if found is None else sensor_findings(found, None, machine.sensors, known)
     return LatestData(
-        window=None if (judged := window.again()) is None else judged(),
+        window=found,
         filled=window.filled if report is None else report.filled,
         parameters=() if report is None else report.parameters,
         why_not=_NOT_EVALUATED if report is None else report.reason,
         blocks=() if newest is None else (_block(newest),),
-        sensors=tuple(_missing(one) for one in channels if one not in sent) if report is None else report.sensors,
+        sensors=known,
     )
 
 

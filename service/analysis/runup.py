@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,7 @@ class RunUp:
     revolutions: int | None  # per vector; None if each vector is from one window of the monitor
     time_ns: npt.NDArray[np.int64]  # (n,)
     speed_rad_s: FloatArray  # (n,), negative if the shaft turns from z to y
-    # (n, n_channels), amplitude in `units`, phase lag 0 to 360°.
+    # (n, n_channels), amplitude in `units`, phase lag 0 to 360°; NaN for windows of a history without the channel's.
     amplitude: FloatArray
     lag_deg: FloatArray
     slow_roll_rpm: float | None  # the mean vector up to this speed was subtracted
@@ -52,7 +53,7 @@ def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp
         levels = {one.channel: one for one in report.levels}
         names = (measure, f"{measure}_phase_lag_deg")
         values = [tuple(getattr(levels.get(one.name), name, None) for name in names) for one in channels]
-        if report.speed_rad_s is not None and all(None not in pair for pair in values):
+        if report.speed_rad_s is not None and any(None not in pair for pair in values):
             found.append((report.end_ns, report.speed_rad_s, values))
     if not found:
         raise RotorwatchError(
@@ -60,6 +61,8 @@ def _past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp
             f"{', '.join(one.name for one in channels)}: phases need a keyphasor, and are kept of 1x and 2x"
         )
     vectors = np.array([row for _, _, row in found], dtype=np.float64)
+    told = np.asarray(np.isfinite(vectors).all(axis=2).any(axis=0))
+    channels, vectors = tuple(compress(channels, told)), vectors[:, told]
     return RunUp(
         channels=channels,
         units=tuple(shown_as(channel, "amplitude")[0] for channel in channels),
@@ -149,7 +152,7 @@ class Centreline:
     each_s: float
     time_ns: npt.NDArray[np.int64]  # (n,), middle of the samples averaged
     speed_rad_s: FloatArray  # (n,), NaN without a shaft angle
-    # (n, n_pairs).
+    # (n, n_pairs), NaN for windows of a history without the pair's.
     y_um: FloatArray
     z_um: FloatArray
 
@@ -163,7 +166,7 @@ def _past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Ce
     for report in data.reports:
         means = {one.channel: one.mean for one in report.levels}
         values = [means.get(channel.name) for channel in channels]
-        if None not in values:
+        if any(None not in pair for pair in zip(values[::2], values[1::2], strict=True)):
             rows.append((report.start_ns, report.end_ns, report.speed_rad_s, values))
     if len(rows) < 2:
         raise RotorwatchError(

@@ -11,7 +11,7 @@ from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.level import at_range_end
-from models.diagnosis.sensors.reference import Naming, implicated
+from models.diagnosis.sensors.reference import WITHOUT_SIGNAL, Naming, implicated
 from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialTest
 from models.diagnosis.window.moments import Plan
@@ -27,9 +27,6 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
 _MOST_MISFIT_Z = 2.0  # standard deviations of the misfit within which nothing has to be explained
-
-_FAULTS_WITHOUT_SIGNAL = {FaultKind.MISSING, FaultKind.STUCK}
-"""Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
 
 Newest = tuple[SlidingWindow, SequentialTest]
 """The sliding window whose latest window is evaluated, and the sequential test that asks for shorter stretches."""
@@ -166,7 +163,7 @@ class WindowEvaluator(ABC):
         strength of its line depends on which sensors are left.
         """
         own = [one for one in findings if not plan.states or not set(one.states).issubset(plan.others)]
-        lost, dead = implicated(own), all(one.kind in _FAULTS_WITHOUT_SIGNAL for one in own)
+        lost, dead = implicated(own), all(one.kind in WITHOUT_SIGNAL for one in own)
         enough = dead and plan.angle_column is not None and "theta" not in lost
         return tuple(sorted(lost)) if not own or (enough and self.suffices(plan.states_without(lost), plan)) else None
 

@@ -94,7 +94,7 @@ class LevelWatch:
         return self._judge.judge(levels, self.reference)
 
     def take(self, window: SlidingWindow, missing: Collection[str] = ()) -> None:
-        """Take the levels of the window after a hop; `missing` channels lacked numbers in it."""
+        """Take the levels of the window after a hop; `missing` channels had no signal in it."""
         self._to_learn = None
         found = window.levels(errors=self._takes_first and self._first.learning)
         if found is None:

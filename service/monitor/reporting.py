@@ -73,17 +73,18 @@ class WindowReporter:
         With `skipped`, it is not evaluated because the monitor cannot keep up.
         """
         samples, levels, test = self.samples, self.levels, self.test
-        levels.take(samples, implicated(missing))
         statistics, self.window = samples.statistics(), samples.again()
         there = statistics or samples.statistics(len(samples.hops))  # while it fills
         stood = "" if there is None else self.standstill.found(there)
+        # At a standstill, a sensor without a signal may be alive.
+        dead = missing if there is None or stood else dead_sensors(there, self._machine.sensors, missing)
+        levels.take(samples, implicated(dead))
         if statistics is None:
-            return self._while_it_fills(end_ns, there, missing, standing=bool(stood))
+            return self._while_it_fills(end_ns, there, dead, standing=bool(stood))
         findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
         if not stood and "theta" not in implicated(findings):
             findings += levels.rewired()
-        lost = self.evaluator.spared(self._plan, findings)
-        start_ns, faulty = statistics.start_ns, implicated(findings)
+        lost, start_ns, faulty = self.evaluator.spared(self._plan, findings), statistics.start_ns, implicated(findings)
         faulted = lost != () or not faulty.issubset(self._plan.others)
         if faulted and lost is not None and not (stood or skipped):
             despite = self.evaluator.despite_drift
@@ -156,11 +157,9 @@ class WindowReporter:
         return verdict.model_copy(update={"low_confidence": True, "text": text}) if rival else verdict, rival
 
     def _while_it_fills(
-        self, end_ns: int, there: WindowStatistics | None, missing: tuple[SensorFault, ...], *, standing: bool
+        self, end_ns: int, there: WindowStatistics | None, dead: tuple[SensorFault, ...], *, standing: bool
     ) -> Report:
         """Report on the hops that are `there`: no alarm clears, as other faults are looked for in full windows."""
-        # At a standstill, a sensor without a signal may be alive.
-        dead = missing if there is None or standing else dead_sensors(there, self._machine.sensors, missing)
         if dead and there is not None:
             self._data_path.sensors(dead, there, standing=True)
         self.levels.tell(self._alarms, end_ns, faulty=implicated(dead), standing=standing)

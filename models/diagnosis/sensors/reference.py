@@ -20,7 +20,11 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name, unit_in_text
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
+
+WITHOUT_SIGNAL = {FaultKind.MISSING, FaultKind.STUCK}
+"""Faults of a sensor without a signal: it is certain which sensor it is, and all others can be believed."""
 
 
 def implicated(findings: Iterable[SensorFault]) -> set[str]:

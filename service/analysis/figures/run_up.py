@@ -74,11 +74,12 @@ def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
     grid = figure.add_gridspec(
         3 * rows - 1, columns, height_ratios=([0.01 if found.estimated else 1.0, 1.4, 0.08] * rows)[:-1]
     )
-    speed = np.abs(found.speed_rad_s) * 30 / np.pi
+    rpm = np.abs(found.speed_rad_s) * 30 / np.pi
     for number, channel in enumerate(found.channels):
         row, column = 3 * (number // columns), number % columns
         lower = figure.add_subplot(grid[row + 1, column])
-        amplitude, lag = found.amplitude[:, number], found.lag_deg[:, number]
+        known = np.isfinite(found.amplitude[:, number])
+        speed, amplitude, lag = rpm[known], found.amplitude[known, number], found.lag_deg[known, number]
         top, panels, text = int(np.argmax(amplitude)), [lower], ""
         if not found.estimated:
             panels.append(figure.add_subplot(grid[row, column], sharex=lower))
@@ -143,7 +144,8 @@ def _paint_polar(found: RunUp, name: str, look: Look) -> Figure:
 
 def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
     """Draw the tips of the vectors in order of time, labelled with speeds or times."""
-    lag_deg, amplitude = found.lag_deg[:, number], found.amplitude[:, number]
+    known = np.isfinite(found.amplitude[:, number])
+    lag_deg, amplitude = found.lag_deg[known, number], found.amplitude[known, number]
     lag = np.radians(lag_deg)
     axes.plot(lag, amplitude, ".-", color=COLOURS[0], markersize=3, linewidth=0.7)
     axes.set_rmax(1.12 * float(np.max(amplitude)) or 1.0)
@@ -151,6 +153,7 @@ def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
     axes.set_rlabel_position(45 * (_cut_deg(lag_deg, amplitude) // 45) + 22.5)
     axes.tick_params(labelsize=8)
     along, unit = along_path(found.speed_rad_s, found.time_ns)
+    along = along[known]
     for at in spread_marks(along, amplitude * np.exp(1j * lag), _APART * float(np.max(amplitude))):
         _label(axes, (lag[at], amplitude[at]), along[at], unit, size=4, offset=(4, 4))
     axes.set_xlabel(f"{found.order}× amplitude, {found.units[number]}; marks: {unit}", fontsize=8, color=GREY)
@@ -186,11 +189,13 @@ def centreline(data: Recorded | Past, place: str | None, each_s: float, clearanc
 def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, look: Look) -> Figure:
     columns = len(found.pairs)
     figure = Figure(figsize=look.size_in or (max(7.2, 5.4 * columns), 6.2), layout="constrained")
-    along, unit = along_path(found.speed_rad_s, found.time_ns)
-    norm = Normalize(float(along.min()), float(along.max()))
+    every, unit = along_path(found.speed_rad_s, found.time_ns)
+    norm = Normalize(float(every.min()), float(every.max()))
     panels = figure.subplots(1, columns, squeeze=False)[0]
     for number, (axes, pair) in enumerate(zip(panels, found.pairs, strict=True)):
         path = np.stack([found.y_um[:, number], found.z_um[:, number]], axis=1)
+        known = np.isfinite(path).all(axis=1)
+        path, along = path[known], every[known]
         names = planes_of(pair).names
         start = f"start: {names[0]} {path[0, 0]:.4g} µm, {names[1]} {path[0, 1]:.4g} µm"
         path = path - path[0]

@@ -13,7 +13,7 @@ import numpy as np
 
 from models.commissioning.commissioned import Installed
 from models.diagnosis.sensors.missing import no_data
-from models.diagnosis.sensors.reference import implicated
+from models.diagnosis.sensors.reference import WITHOUT_SIGNAL, implicated
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.signals.block import SampleBlock
@@ -59,9 +59,19 @@ class LatestData:
     sensors: tuple[SensorFault, ...] = ()  # sensor faults in the window
 
     @property
-    def missing(self) -> frozenset[str]:
-        """States without numbers in the window, whose substitute values must not be shown."""
-        return frozenset(implicated(one for one in self.sensors if one.kind is FaultKind.MISSING))
+    def _silent(self) -> tuple[SensorFault, ...]:
+        """Faults of sensors without a signal, and any of the shaft angle."""
+        return tuple(one for one in self.sensors if one.kind in WITHOUT_SIGNAL or one.states == ("theta",))
+
+    @property
+    def lost(self) -> frozenset[str]:
+        """States without a signal in the window, whose values must not be shown as measured; also a faulty angle."""
+        return frozenset(implicated(self._silent))
+
+    @property
+    def why_lost(self) -> str:
+        """Why states that have numbers are `lost`; empty if none are."""
+        return "; ".join(one.text for one in self._silent if one.kind is not FaultKind.MISSING)
 
     def mark(self) -> tuple[object, ...]:
         """Key of everything on which an answer about the window depends; small, so that it can be cached."""
@@ -73,7 +83,7 @@ def heading(
 ) -> dict[str, Any]:
     """Fields of every snapshot: the machine, its window and speed, and the parameter changes that theory assumes."""
     window = data.window
-    speed = np.nan if window is None or "theta" in data.missing else window.speed_rad_s
+    speed = np.nan if window is None or "theta" in data.lost else window.speed_rad_s
     shown = {} if estimated_reason else changes
     return {
         **subject.identity,
@@ -92,8 +102,10 @@ def heading(
 
 
 def unsent(machine: MachineFile, data: LatestData) -> str:
-    """Message on channels without numbers in the window; empty if all had numbers."""
-    return no_data([one.name for one in machine.sensors if state_name(one) in data.missing])
+    """Message on channels without a signal in the window; empty if all had one."""
+    missing = implicated(one for one in data.sensors if one.kind is FaultKind.MISSING)
+    gone = no_data([one.name for one in machine.sensors if state_name(one) in missing])
+    return "; ".join(filter(None, (gone, data.why_lost)))
 
 
 def no_window(machine: MachineFile, data: LatestData) -> str:
@@ -148,7 +160,7 @@ class MachineSnapshots:
     def _theory(self, data: LatestData) -> "Prediction":
         from service.analysis.prediction import NO_PARAMETERS, Prediction, predict  # noqa: PLC0415
 
-        if data.window is None or data.missing & {*data.window.states, "theta"}:
+        if data.window is None or data.lost & {*data.window.states, "theta"}:
             known = self._subject.known
             reason = NO_PARAMETERS if known is None else unsent(self._subject.machine, data) or _NO_WINDOW
             return Prediction(known, None, {}, reason, reason)

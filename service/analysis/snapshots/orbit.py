@@ -42,16 +42,16 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     """
     machine, known, window = subject.machine, subject.known, data.window
     there = orbit_pairs(machine.sensors)
-    pairs = [pair for pair in there if not data.missing & {state_name(one) for one in pair}]
+    pairs = [pair for pair in there if not data.lost & {state_name(one) for one in pair}]
     places = [pair for pair in pairs if pair[0].location in MODELLED]
     path = _newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
     changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""
     estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
-    vectors = None if window is None or "theta" in data.missing else _vectors(window)
+    vectors = None if window is None or "theta" in data.lost else _vectors(window)
     if not there:
         reason = f"{machine.title}: {no_pair(machine.sensors)}"
-    elif pairs != there or "theta" in data.missing:
+    elif pairs != there or "theta" in data.lost:
         reason = unsent(machine, data)
     elif not places:
         reason = ""  # the window does not hold these locations; `path_reason` covers them

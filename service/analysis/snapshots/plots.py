@@ -20,7 +20,7 @@ from rotorwatch.records.plots import (
     WaterfallSnapshot,
     WaveformSnapshot,
 )
-from service.analysis.orbit import recorded_pairs
+from service.analysis.orbit import orbit_pairs, recorded_pairs
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded, Sampled
 from service.analysis.revolutions import Excerpt, newest_revolutions
@@ -152,7 +152,10 @@ def vector_series(
     data: Sampled | Past, channels: tuple[Channel, ...], order: int, revolutions: int, slow_roll_rpm: float | None
 ) -> VectorSeries:
     """Vectors of channels: of every window of a history, or of every `revolutions` revolutions of samples."""
-    found = read_run_up(data, channels, order, revolutions, slow_roll_rpm)
+    if not (sent := data.sent(channels)):
+        raise RotorwatchError(data.lacking)
+    found = read_run_up(data, sent, order, revolutions, slow_roll_rpm)
+    gone = [one.name for one in sent if one not in found.channels]
     every = -(-found.time_ns.size // _MOST_VECTORS)
     return VectorSeries(
         **_whose(data),
@@ -171,6 +174,15 @@ def vector_series(
             for number, (channel, unit) in enumerate(zip(found.channels, found.units, strict=True))
         ),
         steady=steady(found.speed_rad_s),
+        reason="; ".join(
+            filter(
+                None,
+                (
+                    no_data([one.name for one in channels if one not in sent]),
+                    f"no amplitude and phase of {order}x of {', '.join(gone)}" if gone else "",
+                ),
+            )
+        ),
     )
 
 
@@ -178,6 +190,7 @@ def centreline_series(data: Sampled | Past) -> CentrelineSeries:
     """Mean shaft positions at all locations with displacements in both directions."""
     pairs = recorded_pairs(data)
     found = read_centreline(data, pairs, _CENTRELINE_S)
+    gone = [pair[0].location for pair in orbit_pairs(data.descriptor.channels) if pair not in found.pairs]
     return CentrelineSeries(
         **_whose(data),
         times_ns=tuple(found.time_ns.tolist()),
@@ -188,6 +201,7 @@ def centreline_series(data: Sampled | Past) -> CentrelineSeries:
             )
             for pair, y, z in zip(found.pairs, found.y_um.T, found.z_um.T, strict=True)
         ),
+        reason=f"no mean positions at the {' and the '.join(gone)}" if gone else "",
     )
 
 

@@ -66,7 +66,7 @@ def correlation_snapshot(
     columns = [window.states.index(state) for state in states]
     places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]
     measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
-    gone = [number for number, (i, j) in enumerate(places) if data.missing & {states[i], states[j]}]
+    gone = [number for number, (i, j) in enumerate(places) if data.lost & {states[i], states[j]}]
     measured.values[:, gone] = measured.errors[:, gone] = measured.outside_band[gone] = np.nan
     nominal, estimated = _predicted(prediction, used, places, measured)
     return CorrelationSnapshot(
@@ -180,7 +180,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
         for one in prediction.spectra(of_theory, frequencies_hz)
     )
     measured = _grouped(window.spectrum[lines][:, columns][:, :, columns], group)
-    gone = np.isin(states, list(data.missing))
+    gone = np.isin(states, list(data.lost))
     measured[:, gone[:, None] | gone] = np.nan
     spectra = measured, nominal, estimated
     averages = _averages(window.n_segments, group)

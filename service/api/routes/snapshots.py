@@ -180,7 +180,9 @@ def _made(
             between = chosen.since_ns, chosen.until_ns
             return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
         with reader.samples(view, chosen, reach_s) as data:
-            return make(data)
+            values = make(data)
+        reason = "" if chosen.recorded else view.latest.why_lost
+        return values.model_copy(update={"reason": "; ".join(filter(None, (values.reason, reason)))})
     except SnapshotError:
         raise
     except RotorwatchError as error:

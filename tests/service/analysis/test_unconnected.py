@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from models.commissioning.commissioned import Installed, install
 from models.errors import RotorwatchError
 from models.signals.block import SampleBlock
+from service.analysis.figures.run_up import centreline, polar
+from service.analysis.figures.style import Look
 from service.analysis.past import Past
 from service.analysis.recorded import Held, Sampled
 from service.analysis.recorded_window import recorded_window
@@ -29,31 +32,35 @@ from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT, RIG
 from tests.service.rig.live import START_NS, scenario_blocks
 from tests.service.rig.replaying import recorded, recording
+from tests.sure import sure
 
 NAMES = [one.name for one in KIT.sensors]
 SECONDS = 30.0
 
 
 @cache
-def dead(*names: str, between_s: tuple[float, float] = (0.0, SECONDS)) -> tuple[SampleBlock, ...]:
+def dead(
+    *names: str, between_s: tuple[float, float] = (0.0, SECONDS), value: float = np.nan
+) -> tuple[SampleBlock, ...]:
     lacking = np.isin(NAMES, names)
     from_ns, to_ns = (START_NS + round(one * 1e9) for one in between_s)
     return tuple(
-        replace(one, samples=np.where(lacking & (from_ns <= one.start_ns < to_ns), np.nan, one.samples))
+        replace(one, samples=np.where(lacking & (from_ns <= one.start_ns < to_ns), value, one.samples))
         for one in scenario_blocks(SECONDS)
     )
 
 
-def shown(way: str, folder: Path, *names: str) -> tuple[LatestData, Sampled]:
+def shown(way: str, folder: Path, *names: str, value: float = np.nan) -> tuple[LatestData, Sampled]:
     """Data held by a monitor, or read from its recording."""
+    stream = dead(*names, value=value)
     if way != "recorded":
         monitor = MachineMonitor(install(KIT, None))
-        for block in dead(*names):
+        for block in stream:
             monitor.step(block)
         held = held_now(monitor.window, monitor.health(), monitor.blocks)
         held = latest_from_bytes(latest_to_bytes(held)) if way == "of another process" else held
         return held, Held(KIT, held.blocks)
-    data = recorded(recording(folder / "made.mcap", dead(*names), KIT))
+    data = recorded(recording(folder / "made.mcap", stream, KIT))
     lagged = evaluator_for(Installed(KIT)).needs_lags
     return recorded_window(data.source, KIT, "demo/lab", None, None, lagged=lagged), data
 
@@ -85,6 +92,51 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
         waterfall_snapshot(samples, samples.channels(["z1"])[0], "time")
 
 
+@pytest.mark.parametrize("way", ["live", "recorded"])
+def test_a_stuck_channel_is_not_shown_as_a_sensor_that_measures_0(way: str, tmp_path: Path) -> None:
+    data, _ = shown(way, tmp_path, "z1", value=100.0)
+    made = snapshots_of(KIT)
+    spectra, correlations, orbits = made.spectra(data), made.correlations(data), made.orbits(data, 4)
+    for one in (spectra, correlations, orbits):
+        assert one.reason.startswith("z1: repeated the value 100 µm")
+    assert spectra.theory.nominal_reason == spectra.reason
+    density = {one.channel: one for one in spectra.densities}
+    assert set(density["z1"].measured) == {None}
+    assert None not in density["y1"].measured
+    for pair in correlations.pairs:
+        assert (None in pair.measured) == ("z1" in (pair.first, pair.second))
+    assert [one.location for one in orbits.orbits] == ["disc"]
+
+
+def test_a_stuck_channel_has_no_levels() -> None:
+    monitor = MachineMonitor(install(KIT, None))
+    reports = [report for block in dead("z1", value=100.0) for report in monitor.step(block).windows]
+    assert reports[-1].filled == 1
+    for report in reports:
+        levels = {one.channel: one for one in report.levels}
+        assert not levels["z1"].values()
+        assert sure(levels["y1"].overall) > 0
+        assert levels["y1"].s_max is None
+
+
+@pytest.mark.parametrize("way", ["live", "recorded"])
+def test_with_a_shaft_angle_that_stopped_a_machine_has_no_speed(way: str, tmp_path: Path) -> None:
+    stream = dead("theta", between_s=(20.0, SECONDS), value=1.0)
+    if way == "live":
+        monitor = MachineMonitor(install(KIT, None))
+        for block in stream:
+            monitor.step(block)
+        data = held_now(monitor.window, monitor.health(), monitor.blocks)
+    else:
+        source = recorded(recording(tmp_path / "made.mcap", stream, KIT)).source
+        lagged = evaluator_for(Installed(KIT)).needs_lags
+        data = recorded_window(source, KIT, "demo/lab", None, None, lagged=lagged)
+    orbits, spectra = snapshots_of(KIT).orbits(data), snapshots_of(KIT).spectra(data)
+    assert (orbits.speed_rad_s, spectra.speed_rad_s, spectra.rotation_hz) == (None, None, None)
+    assert [one.ellipse for one in orbits.orbits] == [None, None]
+    assert "theta: the shaft angle stood still" in orbits.reason
+
+
 def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
     monitor = MachineMonitor(install(RIG, None))
     for block in scenario_blocks(SECONDS):
@@ -96,13 +148,38 @@ def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
     assert {one.nominal is not None for one in spectra.densities} == {True}
 
 
-def test_plots_of_the_history_show_the_other_sensors() -> None:
+def past(**how: Any) -> Past:
+    """The history of a machine whose probe z1 dies, see `dead`."""
     monitor = MachineMonitor(install(KIT, None))
-    reports = tuple(report for block in dead("z1") for report in monitor.step(block).windows)
-    past = Past(KIT, KIT.title, "the history", reports, ())
-    assert [one.location for one in centreline_series(past).places] == ["disc"]
-    vectors = vector_series(past, past.channels(["y1"]), 1, 8, None)
+    reports = tuple(report for block in dead("z1", **how) for report in monitor.step(block).windows)
+    return Past(KIT, KIT.title, "the history", reports, ())
+
+
+def test_plots_of_the_history_show_the_other_sensors() -> None:
+    history = past()
+    centre = centreline_series(history)
+    assert [one.location for one in centre.places] == ["disc"]
+    assert centre.reason == "no mean positions at the bearing"
+    vectors = vector_series(history, history.channels(["y1", "z1"]), 1, 8, None)
     assert vectors.speeds_rad_s[-1] == pytest.approx(138.2, rel=0.01)
+    assert [one.channel for one in vectors.channels] == ["y1"]
+    assert vectors.reason == "no amplitude and phase of 1x of z1"
+
+
+def test_plots_of_the_history_go_on_when_a_sensor_dies() -> None:
+    """Each sensor ends where it died, and the others go on."""
+    history = past(between_s=(27.0, SECONDS))
+    centre = centreline_series(history)
+    y1, z1 = vector_series(history, history.channels(["y1", "z1"]), 1, 8, None).channels
+    assert None not in y1.amplitude
+    assert z1.amplitude[0] is not None
+    assert z1.amplitude[-1] is None
+    assert centre.times_ns[-1] == (history.reports[-1].start_ns + history.reports[-1].end_ns) // 2
+    bearing, disc = centre.places
+    assert bearing.z_um[-1] is None
+    assert None not in disc.y_um
+    for draw in (polar(history, ["y1", "z1"], 1, 8, None), centreline(history, None, 1.0, None)):
+        draw(Look()).canvas.draw()
 
 
 @pytest.mark.parametrize("way", ["live", "recorded"])

@@ -20,7 +20,8 @@ class CentrelinePlot extends SamplePlot {
 
   /** @param {Centrelines["places"][number]} one */
   #place(one) {
-    const points = one.y_um.flatMap((y, at) => (y === null || one.z_um[at] === null ? [] : [[y - Number(one.y_um[0]), Number(one.z_um[at]) - Number(one.z_um[0])]]));
+    const known = one.y_um.flatMap((y, at) => (y === null || one.z_um[at] === null ? [] : [[y, one.z_um[at]]]));
+    const points = known.map(([y, z]) => [y - known[0][0], z - known[0][1]]);
     const [factor] = shownIn("µm");
     const reach = roundUp(factor * Math.max(...points.flat().map(Math.abs), 1e-3)) / factor;
     const drawn = points.map(([y, z]) => [(REACH * y) / reach, (-REACH * z) / reach]);
