@@ -58,7 +58,7 @@ class MachineMonitor:
     ) -> None:
         self.machine = machine = installed.machine
         self._skips = skips
-        self._alarms = AlarmBook(machine.alarms)
+        self._alarms = AlarmBook(machine.alarms, by_angle="theta" in machine.descriptor.states)
         self._data_path = DataPathAlarms(self._alarms, machine)
         self._reporter = reporter = WindowReporter(installed, self._alarms, self._data_path, remembered=remembered)
         self.identity, self.watching = reporter.identity, reporter.watching

@@ -42,6 +42,7 @@ _LEAST_CHANGES_UNNAMED = 4
 is wrong concerns all of it."""
 _HELD_STIFF_NOTE = "no fault makes a shaft stiffer; something may hold it, such as a locked coupling"
 _VANISHED, _VANISHED_NOTE = -0.9, "its 1x has all but vanished; the sensors may no longer see this shaft"
+_HUNTING_NOTE = "without a shaft angle, a speed that hunts within seconds makes 1x look smaller, too"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +60,10 @@ NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
 
 
 class AlarmBook:
-    """The alarms of one machine."""
+    """The alarms of one machine; `by_angle` says whether its shaft angle is measured."""
 
-    def __init__(self, settings: AlarmSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: AlarmSettings, *, by_angle: bool = True) -> None:
+        self._settings, self._by_angle = settings, by_angle
         self._alarms: dict[str, Alarm] = {}
         self.next_sequence = 0  # number the next event will have
         self._pending_events: list[AlarmEvent] = []
@@ -148,7 +149,7 @@ class AlarmBook:
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
                 larger = reading.relative_change if reading.vector is None else reading.vector.magnitude_change
-                unlikely = _unlikely(reading.name, larger, reading.standard_error)
+                unlikely = _unlikely(reading.name, larger, reading.standard_error, by_angle=self._by_angle)
                 if unlikely:
                     unreserved.discard(reading.name)
                 self.update(
@@ -481,8 +482,13 @@ class AlarmBook:
         return (event,)
 
 
-def _unlikely(name: str, change: float, error: float) -> str:
-    """Why no fault of the machine changes a parameter like that; empty if one may."""
+def _unlikely(name: str, change: float, error: float, *, by_angle: bool) -> str:
+    """Why no fault of the machine changes a parameter like that, or need not have; empty if one may.
+
+    Without a shaft angle, the rotation is sought as a line of the vibration.
+    """
     if name == "EI" and change > Z95 * error:
         return _HELD_STIFF_NOTE
-    return _VANISHED_NOTE if name == "e" and change < _VANISHED else ""
+    if name == "e" and change < _VANISHED:
+        return _VANISHED_NOTE
+    return _HUNTING_NOTE if name == "e" and change < 0 and not by_angle else ""

@@ -217,9 +217,9 @@ def test_an_equally_likely_wrong_gain_is_named_beside_the_parameters(change: flo
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
-def lasting(said: Verdict) -> list[AlarmEvent]:
+def lasting(said: Verdict, *, by_angle: bool = True) -> list[AlarmEvent]:
     """Events of three hops with the same verdict."""
-    book = AlarmBook(SETTINGS)
+    book = AlarmBook(SETTINGS, by_angle=by_angle)
     for number in range(3):
         book.found(said, "", "", number * 5_000_000_000)
     return list(book.take())
@@ -239,6 +239,13 @@ def test_an_unbalance_that_has_vanished_has_low_confidence() -> None:
     (event,) = lasting(verdict({"e": 0.99}, change=-0.95))
     assert event.alarm.low_confidence
     assert "no longer see this shaft" in event.text
+
+
+@pytest.mark.parametrize(("change", "by_angle"), [(-0.4, False), (0.4, False), (-0.4, True)])
+def test_without_a_shaft_angle_a_smaller_unbalance_has_low_confidence(change: float, by_angle: bool) -> None:
+    (event,) = lasting(verdict({"e": 0.99}, change=change), by_angle=by_angle)
+    doubted = change < 0 and not by_angle
+    assert (event.alarm.low_confidence, "a speed that hunts" in event.text) == (doubted, doubted)
 
 
 def test_stiffening_or_small_changes_explain_no_levels_and_a_repaired_shaft_clears() -> None:
