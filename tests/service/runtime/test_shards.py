@@ -42,7 +42,7 @@ from tests.service.rig.live import (
 from tests.service.rig.monitored import answered, client, problem
 from tests.service.rig.preloaded import CONTEXT
 
-SECONDS = 45.0
+SECONDS = 35.0
 NAMES = ("lab", "pump")
 PATHS = (
     "", "/configuration", "/detectable", "/detectable?change=-0.2", "/alarms?all=true", "/alarms/events", "/spectra",
@@ -74,7 +74,7 @@ def fed(folder: Path, count: int) -> Iterator[tuple[Runtime, httpx.Client]]:
     """The machine lab loses a third of its bearing stiffness, pump is healthy; both have sent all data."""
     plan = plan_for(folder, count)
     with running(plan) as runtime, client(runtime) as http:
-        for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@10"),), ()), strict=True):
+        for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@0"),), ()), strict=True):
             send(plan.link.listen[0], scenario_blocks(SECONDS, *faults), load_machine(entry.file))
         for one in runtime.machines():
             until(lambda: one.health().quality.accepted_blocks == 10 * SECONDS, f"all blocks of {one.machine.name}")  # noqa: B023
