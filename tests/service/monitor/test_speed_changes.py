@@ -62,7 +62,7 @@ def test_a_rotation_that_cannot_be_removed_is_not_evaluable_and_no_misfit(
 def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(to: float) -> None:
     """While a window holds both, on the hops before or after the change."""
     change = Event(at_s=66.0, speed_rpm=to * RPM, ramp_s=3.0)
-    windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 130.0, change)
+    windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 113.0, change)
     states = [window.state for window in windows if window.filled == 1.0]
     assert not alarms
     # Only later data show that the newest hop had a part of the change.
