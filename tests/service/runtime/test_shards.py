@@ -142,7 +142,7 @@ def test_answers_do_not_depend_on_the_number_of_processes_and_operations_reach_a
 
 def test_a_hung_process_is_reported_and_a_killed_one_is_restarted_and_resumes(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
-    blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    blocks = scenario_blocks(45.0, parse_fault("k_by=-0.33@0"))
     with running(plan) as runtime, client(runtime) as http, open_session(plan.link.listen[0]) as session:
         lab, pump = runtime.machines()
         feed = Feed(session, lab.machine)
