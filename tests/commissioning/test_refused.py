@@ -94,7 +94,7 @@ def no_such_rotor() -> Commissioning:
     return made_of(blocks, machine)
 
 
-RUNNING_AWAY = Event(at_s=0.0, ramp_s=70.0, speed_rpm=2 * LAB.operation.speed_rpm)
+RUNNING_AWAY = Event(at_s=30.0, ramp_s=10.0, speed_rpm=2 * LAB.operation.speed_rpm)
 SOFTENING = Event(at_s=45.0, parameter="k_by", relative_change=-0.3)
 SOFTER = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"k_by_N_per_m": 4.4e4})})
 COARSE = NOTHING.model_copy(update={"window": NOTHING.window.model_copy(update={"lag_step_s": 0.0025})})

@@ -1,6 +1,7 @@
 """A machine that runs down, so that twice its speed passes a resonance that random forces excite."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.signal import lfilter
 
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, hop_levels, level_plan, window_levels
-from models.levels.reference import learn_levels
+from models.levels.reference import LevelReference, learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.channels import Channel
 from models.signals.waveform import waveform_of
@@ -37,11 +38,15 @@ def window(seed: int, speeds_hz: Sequence[float], *, twice: float = 0.0, times: 
     return window_levels(PLAN, hops, speeds, phase_reference=True)
 
 
+@cache
+def healthy() -> LevelReference:
+    return learn_levels("commissioned", ["y2"], [window(number, [SPEED_HZ] * (HOPS + 1)) for number in range(4)])
+
+
 def judged(levels: WindowLevels, *, own: bool = False) -> str:
     """What is said of the 2x, compared with the machine at its usual speed."""
-    healthy = learn_levels("commissioned", ["y2"], [window(number, [SPEED_HZ] * (HOPS + 1)) for number in range(4)])
     limits = {"limits": [{"channel": "y2", "measure": "x2", "alert": 0.001}]} if own else {}
-    (channel,) = LevelJudge(PLAN, [Y], LevelSettings.model_validate(limits)).judge(levels, healthy)
+    (channel,) = LevelJudge(PLAN, [Y], LevelSettings.model_validate(limits)).judge(levels, healthy())
     found = channel.limit("x2")
     return "" if found is None else found.text
 

@@ -31,16 +31,14 @@ from service.runtime.runtime import Runtime
 from tests.service.analysis.snapshotting import numbers
 from tests.service.rig.live import LAB, START_NS
 from tests.service.rig.monitored import PLACE, answered, client, faulty, problem
-from tests.service.rig.replaying import S, recorded, recording
+from tests.service.rig.replaying import S, recording
 from tests.service.rig.run_up import BLOCKS, CHANNELS, FROM_HZ, LAG, RUNOUT_UM, SECONDS, SHAFT_UM, TO_HZ, angle
 from tests.sure import sure
 
 
-@pytest.fixture(scope="module", params=["newest samples", "recordings"])
-def data(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Sampled:
-    if request.param == "newest samples":
-        return Held(LAB, BLOCKS)
-    return recorded(recording(tmp_path_factory.mktemp("run-up") / "made.mcap", BLOCKS))
+@pytest.fixture(scope="module")
+def data() -> Sampled:
+    return Held(LAB, BLOCKS)
 
 
 def test_a_waveform_is_of_the_newest_revolutions_with_their_pulses(data: Sampled) -> None:
@@ -105,8 +103,7 @@ def test_a_waterfall_follows_the_run_up(data: Sampled) -> None:
 
 def test_vectors_of_a_run_up_have_its_amplitude_and_lag(data: Sampled) -> None:
     found = vector_series(data, CHANNELS, 1, 5, None)
-    assert found.source == ("newest samples" if isinstance(data, Held) else "recordings")
-    assert (found.steady, found.revolutions) == ("", 5)
+    assert (found.source, found.steady, found.revolutions) == ("newest samples", "", 5)
     speed = numbers(found.speeds_rad_s) / (2 * np.pi)
     at_s = (np.array(found.times_ns) - START_NS) / S
     assert speed == pytest.approx(FROM_HZ + (TO_HZ - FROM_HZ) / SECONDS * at_s, rel=5e-3)

@@ -224,8 +224,8 @@ def test_a_run_down_raises_no_alarm() -> None:
     """With one source, where any residual of the rotation would be a misfit; also when it hardly turns."""
     draw = Draw(LAB, SEED, Purpose.EVALUATION, 0, layout=Layout.ONE_SOURCE)
     scenario = draw_condition(draw, 1)
-    stop = Event(at_s=63.0, ramp_s=45.0, speed_rpm=0.1)
-    scenario = scenario.model_copy(update={"duration_s": 125.0, "events": (*scenario.events, stop)})
+    stop = Event(at_s=63.0, ramp_s=30.0, speed_rpm=0.1)
+    scenario = scenario.model_copy(update={"duration_s": 110.0, "events": (*scenario.events, stop)})
     windows, events = feed(monitor(), [block for block, _ in blocks(scenario, LAB)])
     assert events == []
     assert windows[-1].state is HealthState.NOT_EVALUABLE

@@ -41,25 +41,28 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
 @pytest.mark.parametrize(
     ("machine", "duration_s", "change", "told"),
     [
-        (LAB, 79.0, Event(at_s=65.0, speed_rpm=0.65 * RPM, ramp_s=14.0), ""),  # switched off
-        (LAB, 68.0, Event(at_s=63.5, speed_rpm=1.04 * RPM), STEP),
-        (WITHOUT_ANGLE, 105.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=30.0), "the speed left 1056 to 1584 rpm"),
-        (WITHOUT_ANGLE, 95.0, Event(at_s=65.0, speed_rpm=0.3 * RPM, ramp_s=14.0), "5 of 12 hops, evaluation limit 50%"),
+        (LAB, 68.0, Event(at_s=63.5, speed_rpm=1.04 * RPM), [STEP]),
+        (
+            WITHOUT_ANGLE, 103.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=30.0),
+            ["5 of 12 hops, evaluation limit 50%", "the speed left 1056 to 1584 rpm"],
+        ),
     ],
-)
+)  # fmt: skip
 def test_a_rotation_that_cannot_be_removed_is_not_evaluable_and_no_misfit(
-    machine: Machine, duration_s: float, change: Event, told: str
+    machine: Machine, duration_s: float, change: Event, told: list[str]
 ) -> None:
     windows, alarms = watched(machine, machine, duration_s, change)
-    assert (windows[-1].state, alarms) == (HealthState.NOT_EVALUABLE, set())
-    assert told in windows[-1].reason
+    assert not alarms
+    for text, window in zip(told, windows[-len(told) :], strict=True):
+        assert window.state is HealthState.NOT_EVALUABLE
+        assert text in window.reason
 
 
 @pytest.mark.parametrize("to", [pytest.param(0.97, marks=pytest.mark.long), 1.12])
 def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(to: float) -> None:
     """While a window holds both, on the hops before or after the change."""
     change = Event(at_s=66.0, speed_rpm=to * RPM, ramp_s=3.0)
-    windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 130.0, change)
+    windows, alarms = watched(WITHOUT_ANGLE, WITHOUT_ANGLE, 113.0, change)
     states = [window.state for window in windows if window.filled == 1.0]
     assert not alarms
     # Only later data show that the newest hop had a part of the change.
@@ -83,10 +86,10 @@ def commissioned_at_both_speeds() -> Installed:
 
 def test_at_level_none_a_drive_is_judged_at_each_set_point() -> None:
     """A bearing that changes while the window holds both is still named."""
-    changes = [Event(at_s=67.0, speed_rpm=1.15 * RPM, ramp_s=6.0), Event(at_s=170.0, speed_rpm=RPM)]
-    changes += [Event(at_s=100.0, parameter="k_by", relative_change=-0.25)]
+    changes = [Event(at_s=63.0, speed_rpm=1.15 * RPM, ramp_s=6.0), Event(at_s=120.0, speed_rpm=RPM)]
+    changes += [Event(at_s=80.0, parameter="k_by", relative_change=-0.25)]
     monitor = MachineMonitor(commissioned_at_both_speeds())
-    windows, events = feed(monitor, drive(5_290_020, *changes, duration_s=205.0))
+    windows, events = feed(monitor, drive(5_290_020, *changes, duration_s=143.0))
     raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"k_by"}
     assert {window.state for window in windows if window.filled == 1.0} >= {HealthState.HEALTHY}
@@ -97,5 +100,5 @@ def test_without_a_phase_reference_another_rotor_is_outside_the_model() -> None:
     """At a steady speed, and once its rotation is lost."""
     other = LAB.rotor.model_copy(update={"m2_kg": 1.3 * LAB.rotor.m2_kg})
     moving = WITHOUT_ANGLE.model_copy(update={"rotor": other})
-    _, alarms = watched(WITHOUT_ANGLE, moving, 78.0, Event(at_s=68.0, speed_rpm=1.05 * RPM))
+    _, alarms = watched(WITHOUT_ANGLE, moving, 73.0, Event(at_s=63.0, speed_rpm=1.05 * RPM))
     assert alarms == {MODEL}

@@ -26,7 +26,7 @@ from simulator.scenario import parse_fault
 from tests.service.rig.live import ROOT, Feed, endpoint, open_session, scenario_blocks, until
 from tests.service.rig.postgres import postgres_server
 from tests.service.rig.replaying import recording
-from tests.service.runtime.test_shards import SECONDS, plan_for
+from tests.service.runtime.test_shards import plan_for
 
 if TYPE_CHECKING:
     from ray.cluster_utils import Cluster
@@ -70,7 +70,7 @@ def computers_of(runtime: Runtime) -> list[str]:
 
 
 def test_shards_move_off_a_lost_computer_and_onto_a_new_one(cluster: "Cluster", tmp_path: Path) -> None:
-    blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    blocks = scenario_blocks(45.0, parse_fault("k_by=-0.33@0"))
     assert HEALTH_CHECKS in (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
     with postgres_server() as server:
         plan = fleet_plan(tmp_path, server.new_database("fleet"))

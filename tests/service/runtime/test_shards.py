@@ -42,7 +42,7 @@ from tests.service.rig.live import (
 from tests.service.rig.monitored import answered, client, problem
 from tests.service.rig.preloaded import CONTEXT
 
-SECONDS = 45.0
+SECONDS = 35.0
 NAMES = ("lab", "pump")
 PATHS = (
     "", "/configuration", "/detectable", "/detectable?change=-0.2", "/alarms?all=true", "/alarms/events", "/spectra",
@@ -74,7 +74,7 @@ def fed(folder: Path, count: int) -> Iterator[tuple[Runtime, httpx.Client]]:
     """The machine lab loses a third of its bearing stiffness, pump is healthy; both have sent all data."""
     plan = plan_for(folder, count)
     with running(plan) as runtime, client(runtime) as http:
-        for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@10"),), ()), strict=True):
+        for entry, faults in zip(plan.machines, ((parse_fault("k_by=-0.33@0"),), ()), strict=True):
             send(plan.link.listen[0], scenario_blocks(SECONDS, *faults), load_machine(entry.file))
         for one in runtime.machines():
             until(lambda: one.health().quality.accepted_blocks == 10 * SECONDS, f"all blocks of {one.machine.name}")  # noqa: B023
@@ -142,7 +142,7 @@ def test_answers_do_not_depend_on_the_number_of_processes_and_operations_reach_a
 
 def test_a_hung_process_is_reported_and_a_killed_one_is_restarted_and_resumes(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 2)
-    blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    blocks = scenario_blocks(45.0, parse_fault("k_by=-0.33@0"))
     with running(plan) as runtime, client(runtime) as http, open_session(plan.link.listen[0]) as session:
         lab, pump = runtime.machines()
         feed = Feed(session, lab.machine)
