@@ -31,7 +31,7 @@ def watched(machine: Machine, moving: Machine, duration_s: float, change: Event)
         sensors=Sensors(noise_relative=0.01, noise_corner_hz=300.0), events=(change,),
     )  # fmt: skip
     shown = [block for block, _ in blocks(scenario, moving)]
-    windows, events = feed(MachineMonitor(Installed(at_once(machine))), shown)
+    windows, events = feed(MachineMonitor(Installed(machine)), shown)
     return windows, {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
 
 
@@ -51,7 +51,7 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
 def test_a_rotation_that_cannot_be_removed_is_not_evaluable_and_no_misfit(
     machine: Machine, duration_s: float, change: Event, told: list[str]
 ) -> None:
-    windows, alarms = watched(machine, machine, duration_s, change)
+    windows, alarms = watched(at_once(machine), machine, duration_s, change)
     assert not alarms
     for text, window in zip(told, windows[-len(told) :], strict=True):
         assert window.state is HealthState.NOT_EVALUABLE
@@ -100,5 +100,5 @@ def test_without_a_phase_reference_another_rotor_is_outside_the_model() -> None:
     """At a steady speed, and once its rotation is lost."""
     other = LAB.rotor.model_copy(update={"m2_kg": 1.3 * LAB.rotor.m2_kg})
     moving = WITHOUT_ANGLE.model_copy(update={"rotor": other})
-    _, alarms = watched(WITHOUT_ANGLE, moving, 73.0, Event(at_s=63.0, speed_rpm=1.05 * RPM))
+    _, alarms = watched(at_once(WITHOUT_ANGLE), moving, 73.0, Event(at_s=63.0, speed_rpm=1.05 * RPM))
     assert alarms == {MODEL}
