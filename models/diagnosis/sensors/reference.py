@@ -293,7 +293,11 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         n_windows=len(windows),
         n_hops=sum(len(window.waveforms) for window in windows),
         speed_rad_s=float(speeds.mean()) if np.all(np.isfinite(speeds)) else None,
-        channels=tuple(_channel(windows, column, noise.get(column)) for column in range(len(states))),
+        channels=tuple(
+            _channel(windows, column, noise.get(column))
+            for column, state in enumerate(windows[0].sensors)
+            if state != "theta"
+        ),
         pairs=tuple(pairs),
     )
 
@@ -311,13 +315,13 @@ def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseRefer
     squares = np.concatenate([window.hop_waveform.rms[:, column] ** 2 for window in windows])
     rotation = rotation_spread = None
     vectors = [window.rotation_vectors for window in windows]
-    known = [np.abs(each[:, column]) for each in vectors if each is not None]
+    known = [np.abs(each[:, column]) for each in vectors if each is not None and column < each.shape[1]]
     if len(known) == len(windows):
         sizes = np.concatenate(known)
         rotation = float(sizes.mean())
         rotation_spread = float(sizes.std() / max(rotation, np.finfo(float).tiny))
     return ChannelReference(
-        state=windows[0].states[column],
+        state=windows[0].sensors[column],
         mean=float(means.mean()),
         mean_spread=float(means.std()),
         rms=float(np.sqrt(squares.mean())),
