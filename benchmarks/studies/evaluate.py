@@ -215,6 +215,8 @@ def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
     for name, true in _SMALL:
         windows = _changed(lab, "likelihood", o.SEVERAL, name, true)
         found, possible = named(windows), _found_at_bound(windows, name, true)
+        if possible is None:
+            continue
         declared = f"≥ {100 * possible:.1f} %, as at the bound"
         yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {o.SEVERAL}", found, possible, declared)
     one = {f"{name} {true:+.0%}": named(_changed(lab, "likelihood", o.ONE, name, true)) for name, true in _SMALL}
@@ -249,11 +251,13 @@ def _changed(rows: Iterable[Record], by: str, layout: str, name: str, true: floa
     return alone or r.where(same, topic="small")
 
 
-def _found_at_bound(windows: Iterable[Record], name: str, true: float) -> float:
-    """Fraction of windows in which a normally distributed reading at the bound would exceed the threshold.
+def _found_at_bound(windows: Sequence[Record], name: str, true: float) -> float | None:
+    """Fraction of windows in which a normally distributed reading at the bound exceeds the threshold; None without any.
 
     The bound is that of the changed machine in each window's own condition.
     """
+    if not windows:
+        return None
     threshold = window_thresholds(o.RATES[0], len(PARAMETERS)).first
     scaled = to_scale(name, true)
     z = abs(scaled) * slope(name, scaled) / r.floats(row.get("bound") for row in windows)
