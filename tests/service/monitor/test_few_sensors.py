@@ -32,7 +32,7 @@ def test_a_name_has_low_confidence_only_if_a_heavier_disc_explains_the_data_as_w
     event: Event, *, told: bool
 ) -> None:
     scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=120.0, seed=SEED, faults=(event,))
+    scenario = scenario.overridden(duration_s=170.0, seed=SEED, faults=(event,))
     stream = (block for block, _ in blocks(scenario, damped(), 1.0))
     _, events = feed(MachineMonitor(Installed(damped())), stream)
     raised = {one.alarm.name: one for one in events if one.kind == "raised" and one.alarm.name in PARAMETERS}
