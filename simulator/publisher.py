@@ -6,6 +6,7 @@
                 │                   │
                 └──── stop ─────────┴─────────────────────^
 
+An unpaced stream that waited for its subscriber waits again if it is lost, so that it can fetch what it missed.
 Draining matters because closing a Zenoh session discards what has not been delivered yet: several megabytes after an
 unpaced run.
 """
@@ -63,8 +64,8 @@ def publish(
     """Publish descriptor, truth and blocks of one machine until the stream ends or `stop` is set.
 
     Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine. The stream
-    is not advanced before a subscriber is there, if one is waited for. When `stop` is set, publishing ends before the
-    next block and the session closes at once.
+    is not advanced before a subscriber is there, if one is waited for; without a pace, that holds for every block. When
+    `stop` is set, publishing ends before the next block and the session closes at once.
 
     Raises
     ------
@@ -77,15 +78,24 @@ def publish(
     with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:
         # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
         probe = session.declare_publisher(machine.keys.stream)
-        if settings.wait_for_subscriber_s is not None:
-            _wait_for_subscriber(session, probe, machine.keys, settings, stop)
+
+        def wait_for_subscriber() -> None:
+            if settings.wait_for_subscriber_s is not None:
+                _wait_for_subscriber(session, probe, machine.keys, settings, stop)
+
+        def held() -> BlockStream:
+            for item in stream:
+                wait_for_subscriber()
+                yield item
+
+        wait_for_subscriber()
         outlets.descriptor.put(descriptor_payload(machine))
-        summary = _send(outlets, probe, machine, stream, settings, stop, on_block)
+        summary = _send(outlets, probe, machine, stream if settings.pace else held(), settings, stop, on_block)
+        if settings.pace is None and not stop.is_set():
+            wait_for_subscriber()
+            _drain(session, machine.keys, settings.drain_s)
         probe.undeclare()  # type: ignore[no-untyped-call]
-        if not stop.is_set():
-            if settings.pace is None:
-                _drain(session, machine.keys, settings.drain_s)
-            stop.wait(settings.linger_s)
+        stop.wait(settings.linger_s)
         return summary
 
 
@@ -152,12 +162,16 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
             item.undeclare()  # type: ignore[no-untyped-call]
 
 
+def _heard(probe: zenoh.Publisher) -> bool:
+    return bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+
+
 def _wait_for_subscriber(
     session: zenoh.Session, probe: zenoh.Publisher, keys: MachineKeys, settings: PublishSettings, stop: Event
 ) -> None:
     link, timeout_s = settings.link, settings.wait_for_subscriber_s or 0.0
     deadline = time.monotonic() + timeout_s
-    while not probe.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
+    while not _heard(probe):
         if stop.wait(_POLL_S):
             break
         if time.monotonic() > deadline:
@@ -196,7 +210,7 @@ def _send(
         outlets.stream.put(payload, attachment=attachment or None, encoding=encoding)
         elapsed_s = time.monotonic() - begin
         if elapsed_s >= look_s:
-            look_s, heard = elapsed_s + _SUBSCRIBER_CHECK_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+            look_s, heard = elapsed_s + _SUBSCRIBER_CHECK_S, _heard(probe)
         latest = truth[-1] if truth else summary.truth
         summary = RunSummary(summary.blocks + 1, data_s, elapsed_s, latest, heard)
         if on_block is not None:

@@ -109,7 +109,7 @@ def publish(
             "--wait-for-subscriber",
             min=0,
             callback=finite,
-            help="Send nothing before someone listens; give up after SECONDS.",
+            help="Send nothing before someone listens, with --pace max also later; give up after SECONDS.",
         ),
     ] = None,
     linger_s: Annotated[

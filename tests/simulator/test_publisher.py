@@ -142,6 +142,27 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(endpoin
     assert stream.sequences == list(range(1500))
 
 
+def test_an_unpaced_stream_waits_for_a_subscriber_that_was_lost(endpoint: str) -> None:
+    """It does not send the rest to nobody and leave: the next subscriber gets everything."""
+    lost = threading.Event()
+
+    def on_block(summary: RunSummary) -> None:
+        if summary.blocks == 10:
+            lost.wait(180)
+
+    with _publishing(endpoint, on_block, pace=None, wait_for_subscriber_s=180.0, linger_s=1e6) as (stop, outcome):
+        with session_of(LinkSettings(listen=(endpoint,))) as monitor:
+            stream = _Received(monitor, MACHINE.keys.stream)
+            until(lambda: len(stream.samples) >= 10, "10 blocks")
+        lost.set()
+        with session_of(LinkSettings(listen=(endpoint,))) as monitor:
+            stream = _Received(monitor, MACHINE.keys.stream)
+            until(lambda: len(stream.samples) >= 60, "last block")
+            stop.set()
+    assert isinstance(outcome[0], RunSummary)
+    assert sorted(stream.sequences) == list(range(60))
+
+
 def test_arrow_streams_carry_the_same_samples(endpoint: str, monitor: zenoh.Session) -> None:
     stream = _Received(monitor, MACHINE.keys.stream)
     with _publishing(endpoint, pace=None, encoding="arrow", wait_for_subscriber_s=30.0):
