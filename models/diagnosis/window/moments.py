@@ -237,7 +237,9 @@ class HopMoments:
             "products": self.products,
             "segments": self.segments,
             "turned_rad": np.array([self.turned_rad, self.jump_rad], dtype=np.float64),
-            "line": np.array([] if line is None else [line.speed_rad_s, line.sweep_rad_s2, line.strength], np.float64),
+            "line": np.array(
+                [] if line is None else [line.speed_rad_s, line.sweep_rad_s2, line.strength, *line.swing], np.float64
+            ),
             "pair_powers": self.pair_powers,
             **prefixed("waveform", self.waveform.checkpoint()),
             **({} if self.levels is None else prefixed("levels", self.levels.checkpoint())),
@@ -256,7 +258,7 @@ class HopMoments:
             segments=checked(arrays, "segments", np.complex64, (None, None, None)),
             turned_rad=turned_rad,
             jump_rad=jump_rad,
-            line=RotationLine(*line) if line else None,
+            line=RotationLine(line[0], line[1], line[2], tuple(line[3:])) if line else None,
             waveform=Waveform.restored(unprefixed("waveform", arrays)),
             pair_powers=checked(arrays, "pair_powers", np.complex128, (None, None, 3)),
             levels=HopLevels.restored(levels) if (levels := unprefixed("levels", arrays)) else None,

@@ -4,6 +4,9 @@ The unbalance is a line that all channels share. In one hop its frequency hardly
 linear sweep. The most likely frequency and sweep are those at which the channels together have the most power relative
 to their surroundings. Whether there is a line at all is decided over several hops: the largest peak of noise is
 anywhere in the band, while a shaft keeps its speed.
+
+The speed of a machine whose governor hunts swings within a hop. Then the line has lost some of its power, most of which
+a phase that swings recovers: first a sinusoid of few sizes, rates and phases, then any smooth phase that improves it.
 """
 
 from dataclasses import dataclass
@@ -11,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
+from numpy.polynomial import Polynomial
 
 from models.signals.block import FloatArray
 
@@ -23,6 +27,7 @@ _REFINEMENTS = 5
 # Largest relative difference of speed between neighbouring hops of one shaft, apart from its sweep: a lightly damped
 # resonance looks like a line, but its peak wanders by its width.
 _MOST_SPEED_STEP = 0.004
+_SWINGING_STEP = 0.02  # the same at the end of a hop in which the speed swings
 _RESOLVED = 0.25  # part of a hop's frequency resolution below which no difference is believed
 # Relative distance from the straight line through the speeds of most hops beyond which a peak is not the shaft's.
 _MOST_OFF_TREND = 0.03
@@ -32,6 +37,13 @@ _FEW_HOPS = 6  # fewer hops need lines that stand out by themselves
 _HELD, _HELD_PART = 4, 0.5
 # Strength of a hop's line relative to the other hops' up to which a part of the hop had another speed.
 _WEAKER = 0.25
+# Power of a hop's parts over that of the whole, less one, from which on the speed may swing, and which the swing must
+# recover; the same where the line is weak; and what noise makes of it, times the strength.
+_SPREAD, _SPREAD_OF_WEAK, _OF_NOISE, _PARTS = 0.1, 0.8, 10.0, 8
+_SWINGS = np.geomspace(0.25, 5.0, 17)  # periods in a hop
+_MOST_SWING = 0.04  # of the speed to either side
+_SWING_SIZES, _SWING_PHASES = np.linspace(0.125, 1.0, 8), np.arange(8) * np.pi / 4
+_NOT_SINUSOIDAL_RAD, _TINY = 0.3, 1e-3
 LEAST_SETTLED = 0.5  # least part of a window that must be left where a drive goes from one set point to another
 STRONG = 15.0  # strength from which a line stands out by itself: no peak of noise is as strong
 
@@ -40,15 +52,20 @@ STRONG = 15.0  # strength from which a line stands out by itself: no peak of noi
 class RotationLine:
     """The most likely line of one hop."""
 
-    speed_rad_s: float  # its frequency in the middle of the samples
+    speed_rad_s: float  # its frequency in the middle of the samples; where it swings, its mean
     sweep_rad_s2: float  # how fast that changes
     # Its power over that of its surroundings, mean over the channels; about 1 where there is only noise, and some 3 to
     # 8 at the largest peak of noise.
     strength: float
+    swing: tuple[float, ...] = ()  # where the speed swings: coefficients of a polynomial of time that adds to the angle
 
     def angle(self, t_s: FloatArray) -> FloatArray:
         """Angle at times from the middle of the samples, from an unknown zero."""
-        return self.speed_rad_s * t_s + self.sweep_rad_s2 / 2 * t_s**2
+        return self.speed_rad_s * t_s + self.sweep_rad_s2 / 2 * t_s**2 + Polynomial(self.swing or (0.0,))(t_s)
+
+    def speed(self, t_s: FloatArray) -> FloatArray:
+        """Speed at times from the middle of the samples, rad/s."""
+        return self.speed_rad_s + self.sweep_rad_s2 * t_s + Polynomial(self.swing or (0.0,)).deriv()(t_s)
 
 
 def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
@@ -94,7 +111,8 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     for _ in range(_REFINEMENTS):
         frequency_hz, sweep = _climb(baseband, t_s, base_hz, frequency_hz, sweep, step_hz, step_sweep)
         step_hz, step_sweep = step_hz / 2, step_sweep / 2
-    return RotationLine(2 * np.pi * frequency_hz, 2 * np.pi * sweep, strength)
+    line = RotationLine(2 * np.pi * frequency_hz, 2 * np.pi * sweep, strength)
+    return _swinging(line, baseband, t_s, base_hz, grid_hz[inside], min(reach_hz, _MOST_SWING * expected_hz))
 
 
 def _climb(
@@ -109,6 +127,58 @@ def _climb(
     at_hz += _top([power(at_hz + k * step_hz, sweep) for k in (-1, 0, 1)]) * step_hz
     sweep += _top([power(at_hz, sweep + k * step_sweep) for k in (-1, 0, 1)]) * step_sweep
     return at_hz, sweep
+
+
+def _swinging(
+    line: RotationLine, y: _ComplexArray, t_s: FloatArray, base_hz: float, grid_hz: FloatArray, most_hz: float
+) -> RotationLine:
+    """The line with a speed that swings within the hop, if that recovers power; else as it was."""
+
+    def seen(angle: FloatArray) -> _ComplexArray:
+        return np.asarray(y * np.exp(1j * (2 * np.pi * base_hz * t_s - angle))[:, None], dtype=np.complex128)
+
+    straight = seen(line.angle(t_s))
+    power = float(np.sum(np.abs(straight.mean(axis=0)) ** 2))
+    along = straight @ straight.mean(axis=0).conj() / power
+    lost = np.mean([abs(part.mean()) ** 2 for part in np.array_split(along, _PARTS)]) - 1
+    if lost < (max(_SPREAD, _OF_NOISE / 2 / line.strength) if line.strength > STRONG else _SPREAD_OF_WEAK):
+        return line
+    duration_s = float(t_s[1] - t_s[0]) * t_s.size
+    tones = np.exp(2j * np.pi * (base_hz - grid_hz[::2])[:, None] * t_s)
+    found = (-np.inf, line.angle(t_s), 0.0)
+    for swings in _SWINGS:
+        rate = 2 * np.pi * swings / duration_s
+        size = 2 * np.pi * most_hz / rate * _SWING_SIZES
+        swing = size[:, None, None] * np.sin(rate * t_s + _SWING_PHASES[:, None])
+        swing = swing.reshape(-1, t_s.size)
+        powers = np.sum(np.abs((np.exp(-1j * swing)[:, None] * tones) @ y) ** 2, axis=2)
+        best, tone = np.unravel_index(powers.argmax(), powers.shape)
+        if powers[best, tone] > found[0]:
+            found = float(powers[best, tone]), 2 * np.pi * grid_hz[2 * tone] * t_s + swing[best], float(swings)
+    _, angle, swings = found
+    # A swing of about this rate whose size changes, and Legendre polynomials for what is no sinusoid. These are held
+    # small: the error of the angle at one time has the variance of the noise over the line's power.
+    part = 2 * t_s / duration_s
+    sinusoids = np.exp(1j * np.pi * swings * part)[:, None] * np.stack([np.ones_like(part), part], axis=1)
+    free = np.concatenate([part[:, None] ** [0, 1], sinusoids.real, sinusoids.imag], axis=1)
+    basis = np.concatenate([free, np.polynomial.legendre.legvander(part, 4 + round(3 * swings))[:, 2:]], axis=1)
+    held = np.arange(basis.shape[1]) >= free.shape[1]
+    weights, away = basis.T @ basis, np.zeros(basis.shape[1])
+    weights += np.diag(np.where(held, t_s.size / (2 * line.strength) / _NOT_SINUSOIDAL_RAD**2, _TINY))
+    for _ in range(_REFINEMENTS):  # where the angle is nearly right, the imaginary part is how far it is off
+        turned = seen(angle + basis @ away)
+        mean = turned.mean(axis=0)
+        off = (turned @ mean.conj()).imag / np.sum(np.abs(mean) ** 2) + basis @ away
+        away = np.linalg.solve(weights, basis.T @ off)
+    angle = angle + basis @ away
+    recovered = float(np.sum(np.abs(seen(angle).mean(axis=0)) ** 2)) / power
+    if recovered - 1 < max(_SPREAD, _OF_NOISE / (line.strength * recovered)):
+        return line
+    ends = (-duration_s / 2, duration_s / 2)
+    whole = Polynomial.fit(t_s, angle, 4 + basis.shape[1], domain=ends)
+    speed_rad_s = float(whole(ends[1]) - whole(ends[0])) / duration_s
+    coefficients = (whole.convert() - Polynomial((0.0, speed_rad_s))).coef
+    return RotationLine(speed_rad_s, 0.0, line.strength * recovered, tuple(coefficients.tolist()))
 
 
 def _top(values: list[float]) -> float:
@@ -132,8 +202,8 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
             near = np.abs(speed / np.median(speed) - 1) < _MOST_SPEED_STEP * len(lines)
             return speed if np.all(strength > STRONG) and np.all(near) else None
         near = _largest_step(speed, hop_s)
-        steps, swept = np.diff(speed), _swept(lines, hop_s)
-        together = np.abs(steps - swept) < near[1:]
+        steps = np.diff(speed)
+        together = _goes_on(lines, near, hop_s)
     followed = np.append(together, False) | np.insert(together, 0, False)
     if followed.sum() > 1:
         number = np.flatnonzero(followed)
@@ -163,8 +233,9 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     if usual <= STRONG or found.size < 2:
         return np.full(found.shape, True)
     steps = np.diff(followed)
-    near = _largest_step(followed, hop_s)[1:]
-    steady, held = np.abs(steps) < near, np.minimum(np.abs(steps), np.abs(steps - _swept(lines, hop_s))) < near
+    near = _largest_step(followed, hop_s)
+    steady = np.abs(steps) < near[1:]
+    held = steady | _goes_on(lines, near, hop_s)
     # The first and the last hop have only one neighbour.
     level = steady & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
     as_it_was = np.append(steady, level[-1:]) & np.insert(steady, 0, level[:1])
@@ -178,10 +249,13 @@ def _largest_step(speed: FloatArray, hop_s: float) -> FloatArray:
     return np.asarray(np.maximum(_MOST_SPEED_STEP * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
 
 
-def _swept(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray:
-    """Change of speed from hop to hop according to the sweep of their lines, rad/s."""
-    sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])
-    return np.asarray((sweep[1:] + sweep[:-1]) / 2 * hop_s, dtype=np.float64)
+def _goes_on(lines: tuple[RotationLine | None, ...], near: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
+    """Whether a hop begins with the speed at which the one before ends, to within `near`, shape (n_hops,)."""
+    unknown, ends = (np.nan, np.nan, 0.0), np.array([-hop_s, hop_s]) / 2
+    seen = [unknown if line is None else (*line.speed(ends), len(line.swing)) for line in lines]
+    first, last, swings = np.array(seen).T
+    least = np.where(np.maximum(swings[1:], swings[:-1]) > 0, _SWINGING_STEP * last[:-1], near[1:])
+    return np.asarray(np.abs(first[1:] - last[:-1]) < least, dtype=np.bool_)
 
 
 def _speed_trend(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.diagnosis.window.rotation import RotationLine, followed_speeds, settled_hops
+from models.diagnosis.window.rotation import RotationLine, followed_speeds, rotation_line, settled_hops
+from models.signals.block import FloatArray
 from tests.sure import sure
 
 HOP_S, HOPS, SPEED_HZ = 5.0, 12, 15.0
@@ -75,6 +76,43 @@ def test_faint_lines_leave_all_hops_settled() -> None:
     weak = lines(4, 0.01, 0.02, strength=8.0)
     speeds = sure(followed_speeds((*weak[:5], None, *weak[6:]), HOP_S))
     assert settled_hops((*weak[:5], None, *weak[6:]), speeds, HOP_S).all()
+
+
+RATE_HZ, SHAFT_HZ = 500.0, 22.0
+
+
+def hunting(part: float, every_s: float, snr: float = 0.5) -> tuple[FloatArray, FloatArray]:
+    """Two channels of a minute in white noise, and the angle of a shaft whose speed swings by `part`."""
+    rng = np.random.default_rng(SEED)
+    t_s = np.arange(round(62.5 * RATE_HZ)) / RATE_HZ
+    angle = 2 * np.pi * SHAFT_HZ * (t_s - part * every_s / (2 * np.pi) * np.cos(2 * np.pi * t_s / every_s))
+    return snr * np.cos(angle - [[0.0], [1.0]]) + rng.standard_normal((2, t_s.size)), angle
+
+
+@pytest.mark.parametrize("every_s", [2.0, 3.3, 5.0, 8.0, 20.0])
+@pytest.mark.parametrize("part", [0.01, 0.03])
+def test_a_speed_that_hunts_is_followed_within_a_hop(part: float, every_s: float) -> None:
+    channels, angle = hunting(part, every_s)
+    hop, found = round(HOP_S * RATE_HZ), []
+    for first in range(0, angle.size - hop // 2 - hop + 1, hop):  # a hop with half of one before it
+        part_of = slice(first, first + hop + hop // 2)
+        line = sure(rotation_line(channels[:, part_of], RATE_HZ, 2 * np.pi * SHAFT_HZ, 0.05))
+        t_s = np.arange(hop + hop // 2) / RATE_HZ
+        off = np.unwrap(line.angle(t_s - t_s.mean() - 0.5 / RATE_HZ) - angle[part_of])
+        assert np.std(off) < 0.35
+        found.append(line)
+    speeds = sure(followed_speeds(tuple(found), HOP_S))
+    assert np.isfinite(speeds).all()
+    assert settled_hops(tuple(found), speeds, HOP_S).all()
+
+
+def test_a_steady_speed_does_not_swing() -> None:
+    """However strong its line is."""
+    for snr in (0.3, 0.5, 1.0, 10.0):
+        channels, _ = hunting(0.0, 5.0, snr)
+        for first in range(0, channels.shape[1] - 3750, 2500):
+            line = sure(rotation_line(channels[:, first : first + 3750], RATE_HZ, 2 * np.pi * SHAFT_HZ, 0.05))
+            assert line.swing == ()
 
 
 def test_a_single_hop_is_settled() -> None:
