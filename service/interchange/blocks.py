@@ -45,14 +45,29 @@ def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Map
         if entries.dtype.kind not in "fiu":
             raise SourceError(f"{source.path}: {what} holds {entries.dtype}, expected times of pulses")
         return clock.pulse_times(entries, time_unit_ns(keyphasor.unit))
-    signal = Signal(Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
     detector = EdgeDetector(keyphasor.threshold or 0.0, keyphasor.hysteresis, rising=keyphasor.edge == "rising")
     found = [np.empty(0)]
-    for piece in pieces(source, [signal], clock, mapping, Read()):
+    for piece in _pulse_signal(source, keyphasor, clock, mapping):
         if piece.begins:
             detector.interrupt()
         found.append(detector.feed(piece.time_ns, piece.samples[:, 0]))
     return np.concatenate(found)
+
+
+def _pulse_signal(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> Iterator[Piece]:
+    signal = Signal(Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
+    return pieces(source, [signal], clock, mapping, Read())
+
+
+def without_pulses(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> str:
+    """Say where a sampled signal without pulses lies relative to its threshold; empty for times of pulses."""
+    if keyphasor.column is None:
+        return ""
+    found = [piece.samples for piece in _pulse_signal(source, keyphasor, clock, mapping)]
+    return (
+        f"; the signal goes from {min(map(np.nanmin, found)):.6g} to {max(map(np.nanmax, found)):.6g}, "
+        f"threshold = {keyphasor.threshold:g}, hysteresis = {keyphasor.hysteresis:g}"
+    )
 
 
 def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) -> PulseTrain:
@@ -133,6 +148,9 @@ class Written:
     too_short: int = 0  # samples in stretches too short for a block, left out
     missing: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # by channel, start and end times, ns
     none_whole: int = 0  # samples left out in blocks in which every channel lacks some
+    # By channel: number, sum, sum of squares of its samples, and the least and the greatest of them.
+    sums: FloatArray = field(default_factory=lambda: np.zeros(1))
+    reach: FloatArray = field(default_factory=lambda: np.array([[np.inf], [-np.inf]]))
     # Time of the first sample, and of the sample after the last.
     start_ns: int = 0
     end_ns: int = 0
@@ -148,6 +166,8 @@ class BlockMaker:
 
     def __init__(self, machine: MachineFile, origin_ns: int) -> None:
         self._machine, self._origin_ns = machine, origin_ns
+        # Another run for another start: the next file is then not taken for the same publisher with its clock set.
+        self._run = 1 + origin_ns // 1_000_000 % 65_521
         ingest, rate_hz = machine.ingest, machine.rate_hz
         self._least = max(1, int(np.ceil(ingest.block_from_s * rate_hz - 1e-9)))
         most = max(self._least, int(ingest.block_to_s * rate_hz + 1e-9))
@@ -217,8 +237,14 @@ class BlockMaker:
         columns = np.where(lost, np.nan, samples).astype(np.dtype(self._machine.dtype))
         for number in self._angles:  # rounding may reach 2π, which is 0
             columns[:, number] = np.where(columns[:, number] >= _TURN, 0.0, columns[:, number])
-        block = SampleBlock(block_ns, self._sequence, 1, rate_hz, columns)
+        block = SampleBlock(block_ns, self._sequence, self._run, rate_hz, columns)
         self._note(lost, block)
+        there = np.where(lost, 0.0, samples)
+        self.written.sums = self.written.sums + np.array(
+            [~lost * len(there), there.sum(axis=0), (there**2).sum(axis=0)]
+        )
+        least, greatest = self.written.reach
+        self.written.reach = np.array([np.fmin(least, samples.min(axis=0)), np.fmax(greatest, samples.max(axis=0))])
         payload, attachment, encoding = encode_block(block, self._hash)
         yield RecordedMessage(keys.stream, payload, attachment, encoding, block.end_ns, block.end_ns)
         self._sequence, self._new = self._sequence + 1, False

@@ -17,9 +17,10 @@ import numpy as np
 from models.ingest import lasting
 from models.machine import MachineFile
 from models.signals.block import lowest_valid_hz, settling_s
+from models.signals.channels import Quantity, unit_in_text
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
-from service.interchange.blocks import AngleColumn, BlockMaker, Written, pulse_times, read_pulses
+from service.interchange.blocks import AngleColumn, BlockMaker, Written, pulse_times, read_pulses, without_pulses
 from service.interchange.clock import Clock, clock_for
 from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files, unusable
 from service.interchange.mapping import Mapping
@@ -32,6 +33,8 @@ _NOTED = 0.01  # fraction of rows lost from which a note is given
 _LISTED = 10
 _NAMED = 5
 _VARIED = 1.1  # ratio of highest to lowest speed from which both are stated
+# Least and greatest rms that a machine's vibration may well have, SI; samples in a wrong unit are mostly beyond.
+_PLAUSIBLE = {Quantity.DISPLACEMENT: (1e-9, 5e-3), Quantity.VELOCITY: (1e-7, 1.0), Quantity.ACCELERATION: (1e-5, 1e4)}
 _FEW_SAMPLES = 4.0  # samples per keyphasor pulse below which the true pulse rate may be higher (aliasing)
 
 
@@ -107,7 +110,10 @@ def _imported(
         if keyphasor is not None:
             begun = pulse_times(source, keyphasor, clock, mapping)
             runs = runs_of_pulses(begun, files[1:], clock, mapping, machine, keyphasor)
-            pulses = read_pulses(path, runs, keyphasor)
+            try:
+                pulses = read_pulses(path, runs, keyphasor)
+            except SourceError as error:
+                raise SourceError(f"{error}{without_pulses(source, keyphasor, clock, mapping)}") from error
         read = Read()
         parts: Iterator[Piece] = pieces(source, signals, clock, mapping, read)
         if len(files) > 1:
@@ -174,6 +180,7 @@ def summary_lines(done: Imported) -> Iterator[str]:
     yield from _gap_lines(done)
     yield from _filter_lines(done)
     yield from _angle_lines(done)
+    yield from _level_lines(machine, written)
     if read.left_out:
         every = " in every channel" if done.mapping.time.not_finite == "missing" else ""
         yield f"rows left out for an empty cell, NaN, infinity or a number beyond the dtype{every}: {read.left_out}"
@@ -204,6 +211,22 @@ def summary_lines(done: Imported) -> Iterator[str]:
             f"note: {length_s:.6g} s of data do not fill one window of {machine.window.length_s:g} s; reports will be "
             "few or none"
         )
+
+
+def _level_lines(machine: MachineFile, written: Written) -> Iterator[str]:
+    """Size of each channel's samples, by which a wrong unit, scale or column is noticed."""
+    count, total, squares = written.sums
+    for at, channel in enumerate(machine.sensors):
+        if channel.quantity is Quantity.SHAFT_ANGLE or not count[at]:
+            continue
+        mean, (least, greatest) = total[at] / count[at], written.reach[:, at]
+        rms = max(0.0, squares[at] / count[at] - mean**2) ** 0.5 if least < greatest else 0.0
+        unit = unit_in_text(channel.unit)
+        low, high = (bound / channel.to_si for bound in _PLAUSIBLE.get(channel.quantity, (0.0, np.inf)))
+        doubt = (
+            "" if low <= rms <= high else f"; note: expected {low:g} to {high:g} rms, are column, unit and scale right?"
+        )
+        yield f"{channel.name}: {rms:.5g} {unit} rms about {mean:.4g}, from {least:.5g} to {greatest:.5g}{doubt}"
 
 
 def _folder_lines(done: Imported) -> Iterator[str]:
@@ -276,20 +299,22 @@ def _filter_lines(done: Imported) -> Iterator[str]:
 
 def _angle_lines(done: Imported) -> Iterator[str]:
     if done.angle.pulses is not None:
-        lines, speed_rpm = _pulse_lines(done, done.angle.pulses)
+        lines, speeds_rpm = _pulse_lines(done, done.angle.pulses)
         yield from lines
     elif (mean_rpm := done.angle.speed_rpm) is not None:
-        speed_rpm = abs(mean_rpm)
+        speeds_rpm = (abs(mean_rpm), abs(mean_rpm))
         way = ", from z to y" if mean_rpm < 0 else ""
-        yield f"shaft angle: {speed_rpm:.6g} rpm on average{way}"
+        yield f"shaft angle: {abs(mean_rpm):.6g} rpm on average{way}"
     else:
         return
     operation = done.machine.operation
-    if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
+    nearest_rpm = np.clip(operation.speed_rpm, *speeds_rpm) if operation is not None else np.nan
+    if operation is not None and abs(nearest_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
         yield f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is diagnosed"
 
 
-def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
+def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], tuple[float, float]]:
+    """Describe the pulses; also return the least and the greatest speed, the mean twice where it varies little."""
     took_ns = np.diff(train.times)[train.known]
     turned = np.diff(train.counts)[train.known] / train.pulses_per_turn
     passed_ns, turns = float(took_ns.sum()), float(turned.sum())
@@ -309,12 +334,20 @@ def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
     if done.angle.unknown:
         without = "without it" if done.angle.partial else "left out"
         lines.append(f"rows {without} because the shaft angle is not known: {done.angle.unknown}")
+        standing = (
+            "" if done.angle.partial else '; where the shaft stands still, time.not_finite = "missing" keeps the rest'
+        )
         share = done.angle.unknown / max(1, done.read.rows)
         if share > _NOTED:
             lines.append(
                 f"note: that is {share:.0%} of the file, in which the keyphasor gives no pulses or uneven ones; look "
-                "at its signal and threshold, or leave the shaft angle out of the machine file"
+                f"at its signal and threshold, or leave the shaft angle out of the machine file{standing}"
             )
+    if train.interruptions and train.pulses_per_turn > 1:
+        lines.append(
+            f"note: after each interruption another of the {train.pulses_per_turn} pulses may count as angle 0: phases "
+            "before and after it cannot be compared"
+        )
     keyphasor = done.mapping.keyphasor
     samples = done.clock.rate_hz * passed_ns / 1e9 / (turns * train.pulses_per_turn) if turns else np.inf
     if keyphasor is not None and keyphasor.column is not None and samples < _FEW_SAMPLES:
@@ -329,4 +362,4 @@ def _pulse_lines(done: Imported, train: PulseTrain) -> tuple[list[str], float]:
             f"note: {outside} of {train.times.size} pulses are outside of the {lasting(end_ns / 1e9)} of the rows; are "
             "they on the time base of the rows, in keyphasor.unit?"
         )
-    return lines, speed_rpm
+    return lines, (least_rpm, most_rpm) if between else (speed_rpm, speed_rpm)

@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 from models.errors import MachineFileError
+from models.ingest import Gate
+from models.signals.recording import read_recording
+from models.signals.wire import decode_block
 from tests.interchange.material import (
     CHANNELS,
     GOOD,
     PULSES,
     SAMPLED,
     START,
+    START_NS,
     TEXT,
     archive,
     fault,
     imported,
+    machine,
     signals,
     stretches,
     summary,
@@ -195,6 +200,69 @@ def test_a_speed_range_is_reported_beside_the_mean(tmp_path: Path, faster_hz: fl
     mapping = f'{PULSES}column = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
     told = summary(tmp_path, source, mapping)
     assert f"rpm on average{says}" in told
+
+
+def test_a_run_up_through_the_speed_of_the_machine_file_is_not_doubted(tmp_path: Path) -> None:
+    time, x, v, _ = signals(8000)
+    for greatest_hz, doubted in ((15.0, True), (24.0, False)):
+        turns = 10.0 * time + (greatest_hz - 10.0) * time**2 / 8
+        source = archive(tmp_path, x=x, v=v, k=np.mod(turns, 1.0) < 0.5)
+        told = summary(tmp_path, source, f'{PULSES}column = "k"\nthreshold = 0.5\n')
+        assert ("note: the machine file says speed_rpm = 1320" in told) == doubted
+
+
+@pytest.mark.parametrize(("edge", "threshold"), [("rising", 1.5), ("falling", -0.5)])
+def test_a_signal_without_pulses_is_refused_with_its_range(tmp_path: Path, edge: str, threshold: float) -> None:
+    time, x, v, _ = signals(4000)
+    source = archive(tmp_path, x=x, v=v, k=np.mod(22.0 * time, 1.0) < 0.5)
+    mapping = f'{PULSES}column = "k"\nthreshold = {threshold}\nhysteresis = 0.2\nedge = "{edge}"\n'
+    says = f"the signal goes from 0 to 1, threshold = {threshold}, hysteresis = 0.2"
+    with pytest.raises(MachineFileError, match=f"keyphasor column k: 0 pulses, expected at least two .*; {says}"):
+        imported(tmp_path, source, mapping)
+
+
+@pytest.mark.parametrize("marks", [1, 4])
+def test_lost_pulses_are_reported_with_what_they_cost(tmp_path: Path, marks: int) -> None:
+    time, x, v, _ = signals(8000)
+    stands = (time > 2.0) & (time < 2.6)
+    source = archive(tmp_path, x=x, v=v, k=(np.mod(22.0 * marks * time, 1.0) < 0.5) & ~stands)
+    mapping = f'{PULSES}column = "k"\nthreshold = 0.5\npulses_per_revolution = {marks}\n'
+    told = summary(tmp_path, source, mapping)
+    assert '; where the shaft stands still, time.not_finite = "missing" keeps the rest' in told
+    assert ("another of the 4 pulses may count as angle 0: phases before and after it cannot" in told) == (marks > 1)
+    told = summary(tmp_path, source, mapping.replace("[time]", '[time]\nnot_finite = "missing"'))
+    assert "1 interruptions" in told
+    assert "where the shaft stands still" not in told
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("um", 1), ("mm", 1000)])
+def test_the_size_of_samples_is_reported_and_doubted(tmp_path: Path, unit: str, factor: int) -> None:
+    _, _, v, a = signals(2000)  # 22 revolutions
+    source = archive(tmp_path, x=20 * np.cos(a) - 12, v=v * 0, a=a)
+    told = summary(tmp_path, source, (SAMPLED + CHANNELS).replace('"um"', f'"{unit}"'))
+    size = f"y1: {14.142 * factor:g} µm rms about {-12.0 * factor:.4g}, from {-32 * factor} to {8 * factor}"
+    doubt = "; note: expected 0.001 to 5000 rms, are column, unit and scale right?" if factor > 1 else ""
+    assert f"\n{size}{doubt}\n" in told
+    assert "\ny1_dot: 0 mm/s rms about 0, from 0 to 0; note: expected 0.0001 to 1000 rms, are column" in told
+
+
+@pytest.mark.parametrize(("later_s", "step_s"), [(0.5, 0.0), (86_400.0, 86_399.5)])
+def test_files_imported_one_by_one_are_not_taken_for_a_clock_that_was_set(
+    tmp_path: Path, later_s: float, step_s: float
+) -> None:
+    time, x, v, a = signals(4000)
+    gate, verdicts = Gate(machine()), []
+    for start_ns in (START_NS, START_NS + round(later_s * 1e9)):
+        rows = slice(1000) if start_ns == START_NS else slice(1000, None)
+        source = archive(tmp_path, t=time[rows] - time[rows][0], x=x[rows], v=v[rows], a=a[rows])
+        out = imported(tmp_path, source, TEXT.replace(START, f"{np.datetime64(start_ns, 'ns')}Z"))[1]
+        for message in read_recording(out, keys={machine().keys.stream}):
+            verdicts.append(gate.judge(*decode_block(message.payload, message.attachment, message.encoding)))
+    assert all(one.accepted for one in verdicts) == (step_s == 0)
+    assert sum(one.gap_s for one in verdicts) == 0
+    stepped = [one for one in verdicts if one.clock_step_s]
+    assert [one.new_run for one in stepped] == [True] * (step_s > 0)
+    assert sum(one.clock_step_s for one in stepped) == pytest.approx(step_s, abs=1.0)
 
 
 def test_dates_in_a_column_beside_a_start_are_refused(tmp_path: Path) -> None:
