@@ -111,6 +111,13 @@ def test_a_wrong_heavy_spot_angle_in_the_file_is_refused_with_the_measured_one()
     assert "unbalance_phase_rad = " in report.summary
 
 
+def test_an_unbalance_far_below_the_recorded_one_in_the_file_is_refused() -> None:
+    rotor = LAB.rotor.model_copy(update={"e_m": LAB.rotor.e_m / 40})
+    report = commissioned(LAB.model_copy(update={"rotor": rotor}), healthy(LAB, 75.0, 4_910_012)).report
+    assert report.verdict == "refused"
+    assert "unbalance (eccentricity) differs between the healthy data and the parameters in the" in report.summary
+
+
 def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
     """The lines are of a gear, hum, and the second harmonic of every real machine: theory has none of them."""
     made = commissioned(PARTIAL, recording(PARTIAL, with_lines(stream(70.0, 41), {50.03: 0.1, 37.3: 0.1}, order=2)))

@@ -120,6 +120,17 @@ def test_an_imprecise_reading_states_its_error(window: WindowStatistics) -> None
 
 
 @pytest.mark.parametrize(
+    ("name", "change", "error", "read"), [("e", 7.0, 0.3, True), ("e", 0.9, 0.3, False), ("k_by", 7.0, 0.3, False)]
+)
+def test_an_unbalance_that_is_many_times_the_nominal_one_is_read(
+    window: WindowStatistics, name: str, change: float, error: float, read: bool
+) -> None:
+    """Its error grows in proportion, and would otherwise hide the largest unbalances."""
+    diagnosis = Diagnosis("likelihood", (parameter_reading(name, "likelihood", change, error),))
+    assert [one.name for one in determined(diagnosis, window, 60.0).evaluable] == [name] * read
+
+
+@pytest.mark.parametrize(
     ("mean", "spread"), [*((mean, 0.0) for mean in (0.5, 0.948, 1.052, 2.0)), (1.0, 0.1501), (1.0, 0.2), (1.0, 0.6)]
 )
 def test_a_speed_out_of_range_or_unsteady_is_stated_with_its_limit(

@@ -177,6 +177,7 @@ def added(stretches: Sequence[Stretch]) -> Stretch:
 
 
 _VAGUE = 0.2  # largest standard error in a full window with which a reading says anything
+_CERTAIN = 5.0  # standard errors by which a larger unbalance must be certain to be read with an error in its proportion
 _NO_PHASE = "no phase reference"
 _NO_ROTATION = f"{_NO_PHASE}, and no rotation found in the vibration: measure the shaft angle to have it judged"
 _NO_ROTOR = "cannot be told without the rotor's own parameters"
@@ -248,6 +249,8 @@ def _stated(
     if reading.relative_change is None:
         return reading
     error = math.nan if reading.standard_error is None else reading.standard_error
+    if name == "e":  # of an unbalance many times the nominal one, the error is as many times larger
+        vague *= max(1.0, 1 + reading.relative_change - _CERTAIN * error)
     if not error < vague:
         return no_reading(name, by, not_determined(error, vague))
     vector = diagnosis.unbalance if name == "e" else None
