@@ -66,13 +66,15 @@ class Standstill:
             angle = window.sensors.index("theta")
             if np.any((hops.longest_run[:, angle] >= hops.n_samples) & ~quiet):
                 return ""  # the angle is lost while the machine runs
-        stood_s = float(np.sum(still & quiet)) * window.duration_s / len(still)
-        if not stood_s:
+        stood = still & quiet
+        if not stood.any():
             return ""
+        stood_s = float(np.sum(stood)) * window.duration_s / len(stood)
+        is_, have = ("is", "have") if stood[-1] else ("was", "had")
         return (
-            f"the machine is at a standstill, or all its sensors have lost their supply: for {stood_s:.3g} s of the "
-            f"window no rotation, and in every channel less than {QUIET:.0%} of the vibration of the running machine; "
-            "parameters are not judged, and channels are not compared"
+            f"the machine {is_} at a standstill, or all its sensors {have} lost their supply: for {stood_s:.3g} s of "
+            f"the window no rotation, and in every channel less than {QUIET:.0%} of the vibration of the running "
+            "machine; parameters are not judged, and channels are not compared"
         )
 
     def checkpoint(self) -> dict[str, np.ndarray]:
