@@ -113,7 +113,8 @@ def check_sensors_of(
             f"{recording}: {texts[0]}" + (f" (in {len(texts)} windows)" if len(texts) > 1 else "")
             for (recording, _, _), texts in faults.items()
         ),
-        advice="repair, re-range or rewire these sensors, and record again: a fault must not become the healthy state",
+        advice="repair, re-range or rewire these sensors, or correct their units and scales, and record again: a fault "
+        "must not become the healthy state",
     )
 
 

@@ -20,6 +20,7 @@ _MOST_RATIO = 2000
 _LATEST_NS = 9_214_646_400 * 10**9  # 2262: nanoseconds since 1970 fill 64 bits soon after
 _MOST_RATE_DIFFERENCE = 1e-4
 """Largest relative difference of the mapping's and the file's rate: WAV rounds to whole Hz, UFF steps to six digits."""
+_HOUR_NS = 3_600e9
 _YEAR_NS = 31_556_952e9
 
 
@@ -196,6 +197,8 @@ def check_order(path: Path, column: Reference | None, times: FloatArray, first_r
         back_ns = times[at - 1] - times[at]
         what = "repeats the time of the row before" if back_ns == 0 else f"goes back by {lasting(back_ns / 1e9)}"
         hint = "" if back_ns else "; times written with too few decimals? Leave the column out and give time.rate_hz"
+        if abs(back_ns - _HOUR_NS) < _HOUR_NS / 60:
+            hint = "; the end of summer time? Leave the column out and give time.start and time.rate_hz"
         raise SourceError(f"{path}: row {first_row + at + 1}, column {column}: {what}, expected ascending times{hint}")
 
 

@@ -288,11 +288,16 @@ def _filter_lines(done: Imported) -> Iterator[str]:
             )
     if done.clock.ratio != 1:
         ratio = done.clock.ratio
-        lowest_rate_hz = min(machine.rate_hz, done.clock.rate_hz)
+        highest_hz, held_hz = 0.42 * min(machine.rate_hz, done.clock.rate_hz), 0.42 * done.clock.rate_hz
         yield (
             f"resampled from {done.clock.rate_hz:.9g} to {machine.rate_hz:.9g} Hz by {ratio.numerator}/"
-            f"{ratio.denominator} (polyphase); flat up to {0.42 * lowest_rate_hz:.4g} Hz"
+            f"{ratio.denominator} (polyphase); flat up to {highest_hz:.4g} Hz"
         )
+        if held_hz < machine.window.band_hz[1]:
+            yield (
+                f"note: the machine file evaluates up to window.band_hz = {machine.window.band_hz[1]:g} Hz, and the "
+                f"file holds nothing above {held_hz:.4g} Hz: is its rate right?"
+            )
     if done.cut_rows:
         yield f"rows left out at the ends of stretches, where filters settle: {done.cut_rows}"
 

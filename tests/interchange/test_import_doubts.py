@@ -265,6 +265,29 @@ def test_files_imported_one_by_one_are_not_taken_for_a_clock_that_was_set(
     assert sum(one.clock_step_s for one in stepped) == pytest.approx(step_s, abs=1.0)
 
 
+@pytest.mark.parametrize(("rate_hz", "doubted"), [(320, True), (400, False), (4000, False)])
+def test_a_file_sampled_too_slowly_for_the_band_is_doubted(tmp_path: Path, rate_hz: int, doubted: bool) -> None:
+    _, x, v, a = signals(4 * rate_hz, rate_hz)
+    mapping = SAMPLED.replace("2000.0", f"{rate_hz}\nresample = true") + CHANNELS
+    told = summary(tmp_path, archive(tmp_path, x=x, v=v, a=a), mapping)
+    says = "note: the machine file evaluates up to window.band_hz = 150 Hz, and the file holds nothing above 134.4 Hz"
+    assert (says in told) == doubted
+    assert ("evaluates up to" in told) == doubted
+
+
+@pytest.mark.parametrize(("hours", "hinted"), [(1, True), (2, False)])
+def test_local_times_across_the_end_of_summer_time_are_refused_with_a_hint(
+    tmp_path: Path, hours: int, hinted: bool
+) -> None:
+    begin = np.datetime64("2026-10-25T02:59:59.500", "ns")
+    times = begin + np.arange(2000) * np.timedelta64(500, "us")
+    times[1000:] -= np.timedelta64(hours, "h")
+    source = archive(tmp_path, **dict(zip("txva", (times, *signals(2000)[1:]), strict=True)))
+    with pytest.raises(MachineFileError, match=f"row 1001, column t: goes back by {hours * 3600} s") as raised:
+        imported(tmp_path, source, f'[time]\ncolumn = "t"\nunit = "datetime"\nzone = "Europe/Berlin"\n{CHANNELS}')
+    assert ("the end of summer time? Leave the column out and give time.start" in str(raised.value)) == hinted
+
+
 def test_dates_in_a_column_beside_a_start_are_refused(tmp_path: Path) -> None:
     _, x, v, a = signals(1000)
     dates = np.datetime64("2026-01-31T12:00:00", "us") + 500 * np.arange(1000)
