@@ -27,6 +27,7 @@ from models.signals.block import FloatArray
 _ROUNDS = 8
 _SETTLED = 0.02  # largest relative move of a parameter in the last round
 _ONE_SIZE = 0.1  # largest relative deviation of an unbalance's size that may come from another speed or load
+_MOST_TURNED_DEG = 20.0  # between healthy windows; more is another zero of the shaft angle rather than a change
 _MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
 _START_DAMPING = (0.05, 0.2)  # the second one where the first is too far off for any window to be read
 _LEAST_TOLERANCE = 0.05
@@ -84,10 +85,16 @@ def identify(
         if max(abs(value) for value in moves.values()) < _SETTLED:
             break
     else:
+        restless = max(moves, key=lambda name: abs(moves[name]))
+        turned = [one.unbalance.turned_deg or 0.0 for one in diagnoses if one.unbalance and one.unbalance.turned]
+        why = "masses or shaft of [rotor] may be wrong, or the machine is not a bearing with an overhung disc"
+        if restless == "e" and max(turned, default=0.0) - min(turned, default=0.0) > _MOST_TURNED_DEG:
+            why = (
+                f"its heavy spot is at angles that differ by {max(turned) - min(turned):.0f}°: the zero of the shaft "
+                "angle must be the same in all recordings, as with one pulse per revolution; or leave the angle out"
+            )
         raise EstimationError(
-            f"{machine.title}: the rotor cannot be identified: after {_ROUNDS} rounds "
-            f"{max(moves, key=lambda name: abs(moves[name]))} still moves; masses or shaft of [rotor] may be wrong, or "
-            "the machine is not a bearing with an overhung disc"
+            f"{machine.title}: the rotor cannot be identified: after {_ROUNDS} rounds {restless} still moves; {why}"
         )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance

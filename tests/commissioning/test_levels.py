@@ -168,6 +168,24 @@ def test_without_a_shaft_angle_the_unbalance_is_identified_by_its_size(machine: 
     assert abs(sure(next(one for one in first.parameters if one.name == "e").z)) < 4
 
 
+@pytest.mark.slow
+def test_recordings_whose_shaft_angles_have_different_zeros_are_refused_with_that_reason() -> None:
+    """As with several pulses per revolution, any of which may count as 0."""
+    theta = [sensor.name for sensor in PARTIAL.sensors].index("theta")
+    two = []
+    for number in range(2):
+        blocks = stream(33.0, 5_570_030 + number)
+        samples = samples_of(blocks).copy()
+        samples[:, theta] = np.mod(samples[:, theta] + number * np.pi / 2, 2 * np.pi)
+        two.append(recording(PARTIAL, with_samples(blocks, samples)))
+    made = commissioned(PARTIAL, *two)
+    assert made.commissioned is None
+    verdict, text, _ = told_of(made, "can be learned")
+    assert verdict == "refused"
+    assert re.search(r"e still moves; its heavy spot is at angles that differ by (8|9)\d°: the zero of the shaft", text)
+    assert "masses or shaft" not in text
+
+
 def test_without_a_shaft_angle_differing_unbalances_are_not_identified() -> None:
     machine = blind(LAB)
     sizes = [(), (Event(at_s=0.0, parameter="e", relative_change=0.5),)]
