@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter
 
-from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, is_alarm
+from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, data_alarm, is_alarm
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.readings import Z95
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Verdict
 from service.monitor.alarms.alarm import (
     KIND_OF_EVENT,
@@ -146,6 +147,8 @@ class AlarmBook:
         unlike = {"k_by", "k_bz"} <= bearings | softer or (bearings != set() and not verdict.settled)
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
+        # Noise in place of the signals has no 1x, and windows that hold its beginning may be evaluated.
+        blind = not verdict.settled or self.present(data_alarm(FaultKind.INCOHERENT))
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
                 larger = reading.relative_change if reading.vector is None else reading.vector.magnitude_change
@@ -157,7 +160,7 @@ class AlarmBook:
                     reading.relative_change,
                     reading.standard_error,
                     end_ns,
-                    named=reading.name in sure,
+                    named=reading.name in sure and not (blind and unlikely == _VANISHED_NOTE),
                     taken_back=verdict.settled and not hidden and (another or reading.name not in held),
                     low_confidence=outside
                     or hidden

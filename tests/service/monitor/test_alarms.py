@@ -217,9 +217,11 @@ def test_an_equally_likely_wrong_gain_is_named_beside_the_parameters(change: flo
     assert judged([SURE] * 3, outside=True, hidden=True) == ["raised model"]
 
 
-def lasting(said: Verdict, *, by_angle: bool = True) -> list[AlarmEvent]:
-    """Events of three hops with the same verdict."""
+def lasting(said: Verdict, *, by_angle: bool = True, present: str = "") -> list[AlarmEvent]:
+    """Events of three hops with the same verdict, beside an alarm that is present."""
     book = AlarmBook(SETTINGS, by_angle=by_angle)
+    book.update_state(present, bool(present), 0, at_once=True)
+    book.take()
     for number in range(3):
         book.found(said, "", "", number * 5_000_000_000)
     return list(book.take())
@@ -239,6 +241,10 @@ def test_an_unbalance_that_has_vanished_has_low_confidence() -> None:
     (event,) = lasting(verdict({"e": 0.99}, change=-0.95))
     assert event.alarm.low_confidence
     assert "no longer see this shaft" in event.text
+    assert lasting(verdict({"e": 0.99}, change=-0.95), present="data-incoherent") == []
+    assert lasting(verdict({"e": 0.99}, change=-0.95, settled=False)) == []
+    for change, present in ((-0.5, "data-incoherent"), (-0.95, "data-gain")):
+        assert [event.alarm.name for event in lasting(verdict({"e": 0.99}, change=change), present=present)] == ["e"]
 
 
 @pytest.mark.parametrize(("change", "by_angle"), [(-0.4, False), (0.4, False), (-0.4, True)])
