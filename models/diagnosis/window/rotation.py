@@ -9,6 +9,7 @@ The speed of a machine whose governor hunts swings within a hop. Then the line h
 a phase that swings recovers: first a sinusoid of few sizes, rates and phases, then any smooth phase that improves it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +43,10 @@ _WEAKER = 0.25
 _SPREAD, _SPREAD_OF_WEAK, _OF_NOISE, _PARTS = 0.1, 0.8, 10.0, 8
 _SWINGS = np.geomspace(0.25, 5.0, 17)  # periods in a hop
 _MOST_SWING = 0.04  # of the speed to either side
-_SWING_SIZES, _SWING_PHASES = np.linspace(0.125, 1.0, 8), np.arange(8) * np.pi / 4
-_NOT_SINUSOIDAL_RAD, _TINY = 0.3, 1e-3
+_LEFT = 0.15  # the power that parts may then still have over that of the whole: the swing holds in all of the hop
+_SWING_SIZES, _SWING_PHASES = np.linspace(0.125, 1.0, 8), np.arange(16) * np.pi / 8
+_REFINED = 4  # rates, the best of which is taken
+_NOT_SINUSOIDAL_RAD, _TINY, _DEGREE = 0.3, 1e-3, 24
 LEAST_SETTLED = 0.5  # least part of a window that must be left where a drive goes from one set point to another
 STRONG = 15.0  # strength from which a line stands out by itself: no peak of noise is as strong
 
@@ -137,48 +140,64 @@ def _swinging(
     def seen(angle: FloatArray) -> _ComplexArray:
         return np.asarray(y * np.exp(1j * (2 * np.pi * base_hz * t_s - angle))[:, None], dtype=np.complex128)
 
-    straight = seen(line.angle(t_s))
-    power = float(np.sum(np.abs(straight.mean(axis=0)) ** 2))
-    along = straight @ straight.mean(axis=0).conj() / power
-    lost = np.mean([abs(part.mean()) ** 2 for part in np.array_split(along, _PARTS)]) - 1
+    def power_and_lost(turned: _ComplexArray) -> tuple[float, float]:
+        """Power of the line in the hop, and by which part its power in parts of the hop is larger."""
+        mean = turned.mean(axis=0)
+        power = float(np.sum(np.abs(mean) ** 2))
+        along = turned @ mean.conj() / power
+        return power, float(np.mean([abs(part.mean()) ** 2 for part in np.array_split(along, _PARTS)])) - 1
+
+    power, lost = power_and_lost(seen(line.angle(t_s)))
     if lost < (max(_SPREAD, _OF_NOISE / 2 / line.strength) if line.strength > STRONG else _SPREAD_OF_WEAK):
         return line
     duration_s = float(t_s[1] - t_s[0]) * t_s.size
-    tones = np.exp(2j * np.pi * (base_hz - grid_hz[::2])[:, None] * t_s)
-    found = (-np.inf, line.angle(t_s), 0.0)
+    near_hz = grid_hz[np.abs(2 * np.pi * grid_hz - line.speed_rad_s) <= 2 * np.pi * most_hz][::2]
+    tones = np.exp(2j * np.pi * (base_hz - near_hz)[:, None] * t_s)
+    tried = []
     for swings in _SWINGS:
         rate = 2 * np.pi * swings / duration_s
         size = 2 * np.pi * most_hz / rate * _SWING_SIZES
-        swing = size[:, None, None] * np.sin(rate * t_s + _SWING_PHASES[:, None])
-        swing = swing.reshape(-1, t_s.size)
+        swing = (size[:, None, None] * np.sin(rate * t_s + _SWING_PHASES[:, None])).reshape(-1, t_s.size)
         powers = np.sum(np.abs((np.exp(-1j * swing)[:, None] * tones) @ y) ** 2, axis=2)
         best, tone = np.unravel_index(powers.argmax(), powers.shape)
-        if powers[best, tone] > found[0]:
-            found = float(powers[best, tone]), 2 * np.pi * grid_hz[2 * tone] * t_s + swing[best], float(swings)
-    _, angle, swings = found
-    # A swing of about this rate whose size changes, and Legendre polynomials for what is no sinusoid. These are held
-    # small: the error of the angle at one time has the variance of the noise over the line's power.
-    part = 2 * t_s / duration_s
+        tried.append((float(powers[best, tone]), float(swings), 2 * np.pi * near_hz[tone] * t_s + swing[best]))
+    found, left, angle = 0.0, np.inf, line.angle(t_s)
+    for _, swings, first in sorted(tried, key=lambda one: one[0])[-_REFINED:]:
+        refined = _refined(seen, first, swings, line.strength)
+        power_found, power_left = power_and_lost(seen(refined))
+        if power_found > found:
+            found, left, angle = power_found, power_left, refined
+    recovered = found / power
+    if left > _LEFT or recovered - 1 < max(_SPREAD, _OF_NOISE / (line.strength * recovered)):
+        return line
+    ends = (-duration_s / 2, duration_s / 2)
+    whole = Polynomial.fit(t_s, angle, _DEGREE, domain=ends)
+    speed_rad_s = float(whole(ends[1]) - whole(ends[0])) / duration_s
+    coefficients = (whole.convert() - Polynomial((0.0, speed_rad_s))).coef
+    return RotationLine(speed_rad_s, 0.0, line.strength * recovered, tuple(coefficients.tolist()))
+
+
+def _refined(
+    seen: Callable[[FloatArray], _ComplexArray], angle: FloatArray, swings: float, strength: float
+) -> FloatArray:
+    """An angle that is nearly right, moved to the largest power.
+
+    It moves by a swing of about the same rate whose size changes, and by Legendre polynomials for what is no sinusoid.
+    These are held small: the error of the angle at one time has the variance of the noise over the line's power.
+    """
+    part = np.linspace(-1.0, 1.0, angle.size)
     sinusoids = np.exp(1j * np.pi * swings * part)[:, None] * np.stack([np.ones_like(part), part], axis=1)
     free = np.concatenate([part[:, None] ** [0, 1], sinusoids.real, sinusoids.imag], axis=1)
     basis = np.concatenate([free, np.polynomial.legendre.legvander(part, 4 + round(3 * swings))[:, 2:]], axis=1)
     held = np.arange(basis.shape[1]) >= free.shape[1]
     weights, away = basis.T @ basis, np.zeros(basis.shape[1])
-    weights += np.diag(np.where(held, t_s.size / (2 * line.strength) / _NOT_SINUSOIDAL_RAD**2, _TINY))
+    weights += np.diag(np.where(held, angle.size / (2 * strength) / _NOT_SINUSOIDAL_RAD**2, _TINY))
     for _ in range(_REFINEMENTS):  # where the angle is nearly right, the imaginary part is how far it is off
         turned = seen(angle + basis @ away)
         mean = turned.mean(axis=0)
         off = (turned @ mean.conj()).imag / np.sum(np.abs(mean) ** 2) + basis @ away
         away = np.linalg.solve(weights, basis.T @ off)
-    angle = angle + basis @ away
-    recovered = float(np.sum(np.abs(seen(angle).mean(axis=0)) ** 2)) / power
-    if recovered - 1 < max(_SPREAD, _OF_NOISE / (line.strength * recovered)):
-        return line
-    ends = (-duration_s / 2, duration_s / 2)
-    whole = Polynomial.fit(t_s, angle, 4 + basis.shape[1], domain=ends)
-    speed_rad_s = float(whole(ends[1]) - whole(ends[0])) / duration_s
-    coefficients = (whole.convert() - Polynomial((0.0, speed_rad_s))).coef
-    return RotationLine(speed_rad_s, 0.0, line.strength * recovered, tuple(coefficients.tolist()))
+    return np.asarray(angle + basis @ away, dtype=np.float64)
 
 
 def _top(values: list[float]) -> float:
@@ -192,9 +211,13 @@ def _top(values: list[float]) -> float:
 def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
     """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak is not the shaft's.
 
-    None if no line can be followed. A drive that goes from one set point to another is followed at each of them. The
-    hops are consecutive but for gaps.
+    None if no line can be followed. A drive that goes from one set point to another is followed at each of them. Hops
+    in which the speed swings are followed if that is most of them, about one mean: a shaft that hunts. The hops are
+    consecutive but for gaps.
     """
+    swings = np.array([line.speed_rad_s for line in lines if line is not None and line.swing])
+    if 2 * swings.size < len(lines) or np.ptp(swings) > 2 * _MOST_SWING * np.median(swings):
+        lines = tuple(None if line is None or line.swing else line for line in lines)
     speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
     strength = np.array([0.0 if line is None else line.strength for line in lines])
     with np.errstate(invalid="ignore"):

@@ -44,7 +44,7 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
         (LAB, 79.0, Event(at_s=65.0, speed_rpm=0.65 * RPM, ramp_s=14.0), [""]),  # switched off
         (LAB, 68.0, Event(at_s=63.5, speed_rpm=1.04 * RPM), [STEP]),
         (
-            WITHOUT_ANGLE, 103.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=30.0),
+            WITHOUT_ANGLE, 98.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=30.0),
             ["5 of 12 hops, evaluation limit 50%", "the speed left 1056 to 1584 rpm"],
         ),
         (
