@@ -33,6 +33,11 @@ def recorded(seed: int, count: int, change: float = 0.0, condition: int = 1) -> 
     return tuple(windows_of(samples, plan(rotor, WindowSizes(length_s=LENGTH_S), PROBES)))
 
 
+def healthy_windows() -> tuple[WindowStatistics, ...]:
+    """Six of one recording, enough to learn from."""
+    return recorded(1, 11)[:6]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("healthy", [4, pytest.param(12, marks=pytest.mark.long)])
 def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_windows(healthy: int) -> None:
@@ -54,7 +59,7 @@ def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_w
 
 
 def test_a_20_per_cent_loss_of_stiffness_is_detected_but_not_named() -> None:
-    shape = learn_shape(recorded(1, 6))
+    shape = learn_shape(healthy_windows())
     for window in recorded(2, 8, change=-0.2):
         judged = shape.judge(window)
         assert judged[0].verdict == "changed"
@@ -62,12 +67,12 @@ def test_a_20_per_cent_loss_of_stiffness_is_detected_but_not_named() -> None:
         for one in judged:
             said = one.text.replace(one.state, "")
             assert not any(name in said.split() for name in (*PARAMETERS, "bearing", "disc", "stiffness", "damping"))
-    assert [one.state for one in shape.judge(recorded(1, 6)[0])] == ["y1", "z1", "y2_ddot"]
+    assert [one.state for one in shape.judge(healthy_windows()[0])] == ["y1", "z1", "y2_ddot"]
 
 
 @pytest.mark.slow
 def test_learning_under_varied_excitation_widens_the_healthy_spread() -> None:
-    one_colour = learn_shape(recorded(1, 6))
+    one_colour = learn_shape(healthy_windows())
     other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]
     assert sum(any(one.verdict == "changed" for one in one_colour.judge(window)) for window in other_colours) > 12
     colours = learn_shape(other_colours[:12])
@@ -79,7 +84,7 @@ def test_learning_under_varied_excitation_widens_the_healthy_spread() -> None:
 
 
 def test_fewer_healthy_windows_or_a_shorter_window_lower_the_z_value() -> None:
-    healthy, (changed, *_) = recorded(1, 6), recorded(2, 8, change=-0.2)
+    healthy, (changed, *_) = healthy_windows(), recorded(2, 8, change=-0.2)
     shape = learn_shape(healthy)
     known = sure(shape.judge(changed)[0].z)
     fewer = sure(replace_windows(shape, FEWEST_WINDOWS).judge(changed)[0].z)
@@ -93,13 +98,13 @@ def replace_windows(shape: HealthyShape, count: int) -> HealthyShape:
 
 
 def test_shapes_do_not_depend_on_the_level() -> None:
-    shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
+    shape, (window, *_) = learn_shape(healthy_windows()), recorded(9, 6)
     louder = replace(window, correlation=9.0 * window.correlation)
     assert [one.z for one in shape.judge(louder)] == pytest.approx([one.z for one in shape.judge(window)])
 
 
 def test_a_channel_that_cannot_be_compared_is_not_evaluable_with_a_reason() -> None:
-    shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
+    shape, (window, *_) = learn_shape(healthy_windows()), recorded(9, 6)
     still = replace(window, correlation=0 * window.correlation)
     cases = {
         "it does not move": still,
@@ -117,7 +122,7 @@ def test_a_channel_that_cannot_be_compared_is_not_evaluable_with_a_reason() -> N
 
 
 def test_learning_from_too_little_data_is_refused() -> None:
-    windows = recorded(1, 6)
+    windows = healthy_windows()
     with pytest.raises(EstimationError, match=r"^3 healthy windows: 4 .* six or more are advised"):
         learn_shape(windows[:3])
     with pytest.raises(EstimationError, match="healthy window 4: its lags differ"):
@@ -129,7 +134,7 @@ def test_learning_from_too_little_data_is_refused() -> None:
 
 
 def test_a_shape_round_trips_through_json_and_damaged_json_is_refused() -> None:
-    shape = learn_shape(recorded(1, 6))
+    shape = learn_shape(healthy_windows())
     text = shape.model_dump_json()
     again = HealthyShape.model_validate_json(text)
     assert again == shape
@@ -183,7 +188,7 @@ def test_too_few_healthy_windows_have_no_power_and_state_how_many_suffice() -> N
 
 
 def test_added_noise_never_shows_in_a_channel_that_is_already_white() -> None:
-    shape = learn_shape(recorded(1, 6))
+    shape = learn_shape(healthy_windows())
     white = [0.0] * len(shape.lags_s)
     white[0] = 1.0
     channels = tuple(one.model_copy(update={"mean": tuple(white)}) for one in shape.channels)

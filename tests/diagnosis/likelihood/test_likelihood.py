@@ -21,7 +21,7 @@ from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
 from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
-from simulator.scenario import Event
+from simulator.scenario import Event, Scenario
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario, simulate_window
 from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
@@ -184,6 +184,13 @@ def test_readings_are_unbiased_and_their_errors_honest(name: str, layout: Layout
         assert np.median([[one.standard_error for one in diagnosis.parameters[:2]] for diagnosis in diagnoses]) < 0.003
 
 
+def assert_within_the_model(machine: Machine, healthy: Scenario, most: float = 4.0) -> None:
+    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(healthy, machine))
+    assert sure(diagnosis.misfit_z) < most
+    assert not diagnosis.unexplained
+    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.long) for number in (1, 2))])
 def test_a_single_source_at_a_wandering_speed_is_within_the_model(number: int) -> None:
@@ -192,14 +199,13 @@ def test_a_single_source_at_a_wandering_speed_is_within_the_model(number: int) -
     drawn = draw_condition(Draw(machine, SEED, Purpose.EVALUATION, 31, layout=Layout.ONE_SOURCE), number)
     course = machine.operation.speed_rpm * (1 + 0.03 * np.sin(2 * np.pi * np.arange(66) / 60))
     events = (Event(at_s=at_s, speed_rpm=speed) for at_s, speed in enumerate(course.tolist()))
-    scenario = drawn.model_copy(update={"events": tuple(events)})
-    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(scenario, machine))
-    assert sure(diagnosis.misfit_z) < 4
-    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
+    assert_within_the_model(machine, drawn.model_copy(update={"events": tuple(events)}))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "relative", "corner_hz"), [("lab", 0.02, 10.0), ("light", 0.05, 5.0)])
+@pytest.mark.parametrize(
+    ("name", "relative", "corner_hz"), [pytest.param("lab", 0.02, 10.0, marks=pytest.mark.long), ("light", 0.05, 5.0)]
+)
 def test_noise_that_falls_from_the_bands_lower_end_is_within_the_model(
     name: str, relative: float, corner_hz: float
 ) -> None:
@@ -207,24 +213,20 @@ def test_noise_that_falls_from_the_bands_lower_end_is_within_the_model(
     machine = load_machine(name)
     drawn = draw_condition(Draw(machine, SEED, Purpose.EVALUATION, 32, layout=Layout.ONE_SOURCE), 0)
     noise = drawn.sensors.model_copy(update={"noise_relative": relative, "noise_corner_hz": corner_hz})
-    scenario = drawn.model_copy(update={"sensors": noise})
-    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(scenario, machine))
-    assert sure(diagnosis.misfit_z) < 3
-    assert not diagnosis.unexplained
-    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
+    assert_within_the_model(machine, drawn.model_copy(update={"sensors": noise}), most=3.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "number", "hump_hz"), [("heavy", 0, 18.6), ("light", 2, 27.5)])
+@pytest.mark.parametrize(
+    ("name", "number", "hump_hz"), [("heavy", 0, 18.6), pytest.param("light", 2, 27.5, marks=pytest.mark.long)]
+)
 def test_a_narrow_hump_of_the_forces_beside_a_mode_is_within_the_model(name: str, number: int, hump_hz: float) -> None:
     """With eight polynomials for every force, k_by of *heavy* is 9 standard errors off, and *light* misfits by 27."""
     machine = load_machine(name)
     drawn = draw_condition(Draw(machine, 778031, Purpose.EVALUATION, 33, layout=Layout.INDEPENDENT), number)
     hump = {"hump_share": 0.4, "hump_hz": hump_hz, "hump_damping": 0.1}
-    scenario = drawn.model_copy(update={"sources": tuple(one.model_copy(update=hump) for one in drawn.sources)})
-    diagnosis = LikelihoodFit(machine).diagnose(simulate_scenario(scenario, machine))
-    assert sure(diagnosis.misfit_z) < 4
-    assert all(abs(sure(one.relative_change)) < 4 * sure(one.standard_error) for one in diagnosis.parameters)
+    sources = tuple(one.model_copy(update=hump) for one in drawn.sources)
+    assert_within_the_model(machine, drawn.model_copy(update={"sources": sources}))
 
 
 @pytest.mark.slow

@@ -3,8 +3,6 @@
 import hashlib
 import json
 import signal
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -13,8 +11,8 @@ import pytest
 from models.signals.recording import read_recording
 from service.commands.replay import link_of
 from simulator.scenario import parse_fault
-from tests.service.rig.live import LAB, ROOT, endpoint, machine_file, program, scenario_blocks, until
-from tests.service.rig.preloaded import rotorwatch
+from tests.service.rig.live import LAB, endpoint, machine_file, program, scenario_blocks, until
+from tests.service.rig.preloaded import ran, rotorwatch
 from tests.service.rig.replaying import recording, write
 
 
@@ -47,19 +45,15 @@ def test_output_is_the_same_in_a_file_and_on_the_terminal(faulty: Path, tmp_path
 
 def test_a_full_disk_leaves_no_partial_results_file(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
-    command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--out", str(out))
-    limited = ("sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *command)
-    found = subprocess.run(limited, capture_output=True, text=True, cwd=ROOT, check=False)
+    found = ran("service", "replay", faulty, "--offline", "--out", out, largest_file=8192)
     assert (found.returncode, found.stderr.splitlines()[-1:]) == (2, [f"{out}: cannot be written (File too large)"])
     assert not out.exists()
 
 
 def test_a_full_output_for_progress_is_not_blamed_on_the_results_file(faulty: Path, tmp_path: Path) -> None:
     out = tmp_path / "reports.jsonl"
-    command = (sys.executable, "-m", "service", "replay", str(faulty), "--offline", "--progress", "json")
-    with Path("/dev/full").open("w", encoding="utf-8") as full:
-        argv = [*command, "--out", str(out)]
-        found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    command = ("service", "replay", faulty, "--offline", "--progress", "json", "--out", out)
+    found = ran(*command, out=Path("/dev/full"))
     assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 
 

@@ -34,8 +34,8 @@ from tests.service.rig.live import (
     service,
     until,
 )
+from tests.service.rig.preloaded import Piped, ran
 from tests.service.rig.preloaded import rotorwatch as run
-from tests.sure import sure
 
 
 def test_numpy_computes_in_one_thread() -> None:
@@ -83,9 +83,7 @@ def test_an_inaccessible_file_is_reported_in_one_line(capsys: pytest.CaptureFixt
 
 
 def test_a_full_disk_is_reported_in_one_line() -> None:
-    with Path("/dev/full").open("w", encoding="utf-8") as full:
-        argv = [sys.executable, "-m", "service", "size", "--machines", "3"]
-        found = subprocess.run(argv, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    found = ran("service", "size", "--machines", "3", out=Path("/dev/full"))
     assert (found.returncode, found.stderr) == (1, "the output cannot be written (No space left on device)\n")
 
 
@@ -199,19 +197,18 @@ def test_watch_reports_the_loss_and_return_of_a_monitor(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", [(), ("--json",)])
-def test_watch_ends_when_its_output_is_closed(form: tuple[str, ...]) -> None:
+def test_watch_ends_when_its_output_is_closed(form: tuple[str, ...], tmp_path: Path) -> None:
     address = endpoint()
     command = [sys.executable, "-m", "service", "watch", "--connect", address, *form]
-    with (
-        service(address),
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as watcher,
-    ):
-        sure(watcher.stdout).close()
+    with service(address), (tmp_path / "err").open("w+b") as err:
+        watcher = Piped(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=err, start_new_session=True)
+        watcher.stdin.close()
+        watcher.stdout.close()
         try:
             assert watcher.wait(60) == 0
         finally:
             watcher.kill()
-        assert sure(watcher.stderr).read() == b""
+        assert err.read() == b""
 
 
 def test_reports_alarms_and_health_as_terminal_lines() -> None:

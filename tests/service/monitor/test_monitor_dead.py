@@ -50,8 +50,8 @@ def test_a_change_is_named_without_the_dead_sensors(columns: list[int], value: f
         assert None not in {one.relative_change for one in report.parameters}
         assert all(one.text.endswith("; the machine is diagnosed without it") for one in report.sensors)
     again = resumed(monitor, installed, remembered=True)
-    (reports, _), (same, _) = feed(monitor, stream[495:]), feed(again, stream[495:])
-    assert same == reports
+    (reports, _), (same, _) = feed(monitor, stream[495:]), feed(again, stream[495:650])
+    assert same == reports[:3]
     window = monitor.window() if monitor.window else None
     assert window is not None
     assert window.lines == ()  # the rounding noise of a dead channel has lines anywhere
@@ -118,14 +118,15 @@ def drifted(stream: Sequence[SampleBlock], machine: MachineFile, **gains: float)
 def test_a_change_is_named_although_a_gain_has_drifted(gains: dict[str, float]) -> None:
     """Without the one of two sensors that has drifted, the theory explains the window."""
     monitor = MachineMonitor(identified(), remembered=True)
-    stream = drifted(scenario_blocks(110.0, parse_fault("k_by=-0.2@70")), KIT, **gains)
-    reports, _ = feed(monitor, stream[:695])
+    stream = drifted(scenario_blocks(110.0, parse_fault("k_by=-0.2@70"))[300:], KIT, **gains)
+    reports, _ = feed(monitor, stream[:395])
     full = [one for one in reports if one.filled == 1]
+    assert len(full) == 2
     assert {one.state for one in full} == {HealthState.DATA_HEALTH}
     assert all("is diagnosed without " in fault.text for one in full for fault in one.sensors)
     again = resumed(monitor, identified(), remembered=True)
-    (reports, _), (same, _) = feed(monitor, stream[695:]), feed(again, stream[695:])
-    assert same == reports
+    (reports, _), (same, _) = feed(monitor, stream[395:]), feed(again, stream[395:550])
+    assert same == reports[:3]
     assert raised(monitor) == {"data-gain", "k_by"}
     for reading in reports[-1].parameters:
         change = sure(reading.relative_change) + 0.2 * (reading.name == "k_by")

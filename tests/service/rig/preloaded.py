@@ -6,6 +6,7 @@ Each is a process of its own with its own arguments, environment and output, and
 import gc
 import multiprocessing
 import os
+import resource
 import runpy
 import signal
 import subprocess
@@ -97,21 +98,30 @@ class Piped(Preloaded):
 
 
 def ran(
-    *arguments: str | Path, cwd: Path = _ROOT, environment: dict[str, str] | None = None
+    *arguments: str | Path,
+    cwd: Path = _ROOT,
+    environment: dict[str, str] | None = None,
+    out: Path | None = None,
+    largest_file: int | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run ``python -m ARGUMENTS`` to its end, in the environment of the tests or in one of its own."""
+    """Run ``python -m ARGUMENTS`` to its end, in the environment of the tests or in one of its own.
+
+    Its output may go to a device. Files that it writes have at most `largest_file` bytes.
+    """
     words = tuple(map(str, arguments))
     with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder, "out"), Path(folder, "err")
-        out.touch()
+        told, err = Path(folder, "out"), Path(folder, "err")
+        told.touch()
         err.touch()
-        process = Preloaded(words, cwd, out, err, dict(os.environ) if environment is None else environment)
+        process = Preloaded(words, cwd, out or told, err, dict(os.environ) if environment is None else environment)
         try:
+            if largest_file is not None:
+                resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (largest_file, largest_file))
             code = process.wait(600)
         finally:
             process.kill()
         return subprocess.CompletedProcess(
-            words, code, out.read_text(encoding="utf-8"), err.read_text(encoding="utf-8")
+            words, code, told.read_text(encoding="utf-8"), err.read_text(encoding="utf-8")
         )
 
 
