@@ -46,6 +46,7 @@ _MOST_SWING = 0.04  # of the speed to either side
 _LEFT = 0.15  # the power that parts may then still have over that of the whole: the swing holds in all of the hop
 _SWING_SIZES, _SWING_PHASES = np.linspace(0.125, 1.0, 8), np.arange(16) * np.pi / 8
 _REFINED = 4  # rates, the best of which is taken
+# How far a swing may be off a sinusoid; what keeps the equations of its search regular; degree of the polynomial kept.
 _NOT_SINUSOIDAL_RAD, _TINY, _DEGREE = 0.3, 1e-3, 24
 LEAST_SETTLED = 0.5  # least part of a window that must be left where a drive goes from one set point to another
 STRONG = 15.0  # strength from which a line stands out by itself: no peak of noise is as strong
