@@ -348,7 +348,7 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
     if best is None or (best.gyroscopic == "opposite" and _doubt(best) == _REFUSED):
         raise errors[0]
     if level is KnowledgeLevel.PARTIAL:
-        best = replace(best, checks=(*best.checks, *_not_as_given(machine, best)))
+        best = replace(best, checks=(*best.checks, *_not_as_given(machine, best), *_units_in_doubt(best)))
     return best if best.gyroscopic == "Eq. 27" else replace(best, notes=(*best.notes, _OPPOSITE))
 
 
@@ -370,6 +370,17 @@ def _not_as_given(machine: MachineFile, learned: Learned) -> tuple[Check, ...]:
         "masses or dimensions are not those of the machine: weigh and measure again"
     )
     return (Check(name="values in the machine file", verdict="limited", text=text, advice=advice),)
+
+
+def _units_in_doubt(learned: Learned) -> tuple[Check, ...]:
+    """Check that doubts the units where the identified unbalance is larger than the shaft is thick; empty without."""
+    if learned.machine is None or learned.machine.rotor.e_m <= learned.machine.rotor.shaft_diameter_m:
+        return ()
+    rotor = learned.machine.rotor
+    thick = f"the shaft's diameter of {1e3 * rotor.shaft_diameter_m:.3g} mm"
+    text = f"the unbalance is identified as e_m = {1e3 * rotor.e_m:.3g} mm, more than {thick}"
+    advice = "check unit and scale of every channel: one wrong factor for all leaves changes in % right, but not levels"
+    return (Check(name="units", verdict="limited", text=text, advice=advice),)
 
 
 _DOUBTS = ("passed", "limited", "refused")

@@ -227,8 +227,11 @@ class KnownMachineEvaluator(WindowEvaluator):
             return decided
         if times - _LEAST_STANDARD_ERRORS * error < _MOST_UNBALANCE_RATIO:
             return decided
-        why = f"{self._machine.title}: it would take {times:.1f} times the unbalance of the machine file, the limit is"
-        why = f"{why} {_MOST_UNBALANCE_RATIO:g} times: check the units of the channels and e_m"
+        of, check = "of the machine file", "check the units of the channels and e_m"
+        if self._commissioned:
+            of, check = "of the commissioning", "a part may be lost; if not, check the scales of the channels"
+        why = f"{self._machine.title}: it would take {times:.1f} times the unbalance {of}, the limit is"
+        why = f"{why} {_MOST_UNBALANCE_RATIO:g} times: {check}"
         return replace(decided, suspect="", unexplained=why)
 
     def _require_steady_speed(self, window: WindowStatistics, decided: Diagnosis) -> Diagnosis:

@@ -28,6 +28,7 @@ from models.diagnosis.sensors.reference import Naming
 from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
+from models.signals.channels import Quantity
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, load_scenario
@@ -116,6 +117,22 @@ def test_an_unbalance_far_below_the_recorded_one_in_the_file_is_refused() -> Non
     report = commissioned(LAB.model_copy(update={"rotor": rotor}), healthy(LAB, 75.0, 4_910_012)).report
     assert report.verdict == "refused"
     assert "unbalance (eccentricity) differs between the healthy data and the parameters in the" in report.summary
+
+
+def test_samples_in_a_wrong_unit_are_doubted_and_a_huge_unbalance_later_may_be_a_lost_part() -> None:
+    """A factor that all channels share changes the unbalance alone."""
+    seen = stream(65.0, 4_910_013)
+    factor = [1.0 if one.quantity is Quantity.SHAFT_ANGLE else 1000.0 for one in PARTIAL.sensors]
+    made = commissioned(PARTIAL, recording(PARTIAL, with_samples(seen, samples_of(seen) * factor)))
+    verdict, text, advice = told_of(made, "units")
+    assert (verdict, text.split(", ")[1]) == ("limited", "more than the shaft's diameter of 10 mm")
+    assert advice.startswith("check unit and scale of every channel")
+    grown = np.array(factor) * [1.0 if one == 1.0 else 30.0 for one in factor]
+    (window,) = windows_of(recording(PARTIAL, with_samples(seen, samples_of(seen) * grown)))
+    read = sure(evaluator_for(Installed(PARTIAL, None, sure(made.commissioned))).evaluate(window).deciding)
+    assert (
+        "30.0 times the unbalance of the commissioning, the limit is 20 times: a part may be lost" in read.unexplained
+    )
 
 
 def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
