@@ -29,7 +29,13 @@ _SETTLED = 0.02  # largest relative move of a parameter in the last round
 _ONE_SIZE = 0.1  # largest relative deviation of an unbalance's size that may come from another speed or load
 _MOST_TURNED_DEG = 20.0  # between healthy windows; more is another zero of the shaft angle rather than a change
 _MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
-_START_DAMPING = (0.05, 0.2)  # the second one where the first is too far off for any window to be read
+_Start = tuple[float, float, int, int]
+# Damping ratios of the planes, and which of their modes the strongest peaks are; the next where one is too far off.
+_STARTS: tuple[_Start, ...] = tuple(
+    (*damping, *modes)
+    for modes in ((0, 0), (1, 1), (0, 1), (1, 0))
+    for damping in ((0.05, 0.05), (0.2, 0.2), (0.05, 0.2), (0.2, 0.05))
+)
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
 _NO_STIFFNESS = 1e5  # N/m, placeholder in a plane without any sensor, whose stiffness is never read
@@ -68,14 +74,37 @@ def identify(
     MachineFileError
         If masses or shaft are missing.
     """
-    for damping in _START_DAMPING:
-        whole = in_sense(_first_guess(machine, windows, damping), sense)
+    tried: list[Machine] = []
+    failures: list[EstimationError] = []
+    for start in _STARTS:
+        guess = in_sense(_first_guess(machine, windows, start), sense)
+        if guess in tried:  # the file or the relation of bearing and disc gives what the starts differ in
+            continue
+        tried.append(guess)
         try:
-            diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
-            break
-        except EstimationError:
-            if damping == _START_DAMPING[-1]:
-                raise
+            return _settled(machine, guess, windows, progress, sense, sized=sized)
+        except EstimationError as error:
+            failures.append(error)
+    raise failures[0]
+
+
+def _settled(
+    machine: MachineFile,
+    whole: Machine,
+    windows: Sequence[WindowStatistics],
+    progress: Callable[[int, int], None],
+    sense: Gyroscopic,
+    *,
+    sized: bool,
+) -> Identified:
+    """What is identified from one first guess.
+
+    Raises
+    ------
+    EstimationError
+        If the guess is too far off for the windows to be read, or the parameters do not settle.
+    """
+    diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
     for number in range(_ROUNDS):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
         values, covariance = together.estimate
@@ -195,7 +224,7 @@ def _moved(
     return balanced, [fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in pairs]
 
 
-def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], damping: float) -> Machine:
+def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], start: _Start) -> Machine:
     """First guess of every parameter: from the file, the relation of bearing and disc, or the strongest peak."""
     known = machine.rotor
     if known is None or known.m2_kg is None or known.m1_kg is None:
@@ -211,9 +240,9 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], damp
     guesses = {"e_m": _first_e(windows), **_from_forces(known.m2_kg, windows)}
     given: dict[str, float] = known.model_dump(exclude_none=True)
     if "k_by_N_per_m" not in guesses or "k_bz_N_per_m" not in guesses:
-        guesses |= _from_peak({**guesses, **given}, windows)
+        guesses |= _from_peak({**guesses, **given}, windows, start[2:])
     fields = {**guesses, **given}
-    for axis in "yz":
+    for axis, damping in zip("yz", start[:2], strict=True):
         k = fields[f"k_b{axis}_N_per_m"]
         fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * damping * math.sqrt(k * (known.m1_kg + known.m2_kg)))
     low_hz, high_hz = (edge / machine.time_scale for edge in _CUTOFF_HZ)
@@ -243,11 +272,13 @@ def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str,
     return found
 
 
-def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) -> dict[str, float]:
-    """Stiffness for which the lowest mode is at the strongest peak of its plane."""
+def _from_peak(
+    fields: dict[str, float], windows: Sequence[WindowStatistics], modes: tuple[int, int]
+) -> dict[str, float]:
+    """Stiffness for which one of the `modes` of each plane, from 0, is at its strongest peak."""
     found: dict[str, float] = {}
     window = windows[0]
-    for axis in "yz":
+    for axis, mode in zip("yz", modes, strict=True):
         columns = [n for n, name in enumerate(window.states) if name[0] == axis]
         if not columns:
             found[f"k_b{axis}_N_per_m"] = fields.get("k_by_N_per_m") or found.get("k_by_N_per_m") or _NO_STIFFNESS
@@ -259,16 +290,18 @@ def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) ->
         filler = {name: fields.get(name, rigid) for name in ("k_by_N_per_m", "k_bz_N_per_m")}
         best = min(
             _SCALES,
-            key=lambda scale: abs(_lowest(fields | filler | {f"k_b{axis}_N_per_m": rigid * scale}, axis) - peak_rad_s),
+            key=lambda scale: abs(
+                _natural(fields | filler | {f"k_b{axis}_N_per_m": rigid * scale}, axis, mode) - peak_rad_s
+            ),
         )
         found[f"k_b{axis}_N_per_m"] = rigid * best
     return found
 
 
-def _lowest(fields: dict[str, float], axis: str) -> float:
-    """Lowest natural frequency in a plane, rad/s, at rest."""
+def _natural(fields: dict[str, float], axis: str, mode: int) -> float:
+    """Natural frequency in a plane, rad/s, at rest; `mode` counts from the lowest."""
     damping = {f"c_b{each}_N_s_per_m": fields.get(f"c_b{each}_N_s_per_m", 1.0) for each in "yz"}
     rotor = RotorParameters.model_validate({"e_m": 1e-6, **fields, **damping})
     at = slice(0, 3) if axis == "y" else slice(3, 6)
     squares = np.linalg.eigvals(np.linalg.solve(M_matrix(rotor)[at, at], Q_matrix(rotor)[at, at]))
-    return float(np.sqrt(np.min(squares.real)))
+    return float(np.sqrt(np.sort(squares.real)[mode]))

@@ -157,6 +157,33 @@ def test_a_damped_rotor_is_identified_with_sensors_at_its_bearing_alone() -> Non
     assert (rotor.c_by_N_s_per_m, rotor.c_bz_N_s_per_m) == pytest.approx((160.0, 160.0), rel=0.25)
 
 
+@pytest.mark.parametrize(
+    ("change", "directions"),
+    [
+        ({}, [(-0.4, -0.8, 0.0, 0.3, -0.3, 0.0), (0.8, 0.4, 0.0, 0.3, -0.3, 0.0)]),  # z moves in its second mode
+        ({"k_by_N_per_m": 38e3, "c_by_N_s_per_m": 130.0, "k_bz_N_per_m": 145e3, "c_bz_N_s_per_m": 20.0}, []),
+    ],
+)
+def test_a_rotor_whose_first_guess_is_far_off_is_identified_from_another_one(
+    change: dict[str, float], directions: list[tuple[float, ...]]
+) -> None:
+    """With velocities at the bearing alone, it is read from the strongest peaks and a likely damping."""
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=70.0, seed=2_901_097, faults=())
+    if directions:
+        pairs = zip(scenario.sources, directions, strict=False)
+        sources = tuple(one.model_copy(update={"direction": direction}) for one, direction in pairs)
+        scenario = scenario.model_copy(update={"sources": sources})
+    rotor = LAB.rotor.model_copy(update=change)
+    shaken = tuple(block for block, _ in blocks(scenario, machine.model_copy(update={"rotor": rotor})))
+    kept = {("bearing", Quantity.VELOCITY), ("shaft", Quantity.SHAFT_ANGLE)}
+    file, at_bearing = with_sensors(PARTIAL, shaken, lambda sensor: (sensor.location, sensor.quantity) in kept)
+    found = sure(commissioned(file, recording(file, at_bearing)).machine).rotor
+    for name in PARAMETERS[:4]:
+        field = FAULT_FIELDS[name]
+        assert getattr(found, field) == pytest.approx(getattr(rotor, field), rel=0.05)
+
+
 def test_values_of_an_incomplete_file_that_the_recordings_contradict_are_reported() -> None:
     """They are only a first guess: the identified ones are used, but a wrong mass may be the cause."""
     given = {"k_by_N_per_m": 1.25 * LAB.rotor.k_by_N_per_m, "k_bz_N_per_m": LAB.rotor.k_bz_N_per_m}
