@@ -42,6 +42,7 @@ _WEAKER = 0.25
 # recover; the same where the line is weak; and what noise makes of it, times the strength.
 _SPREAD, _SPREAD_OF_WEAK, _OF_NOISE, _PARTS = 0.1, 0.8, 10.0, 8
 _SWINGS = np.geomspace(0.25, 5.0, 17)  # periods in a hop
+_FEWEST_SAMPLES, _SAMPLES_OF_A_SWING = 26, 6  # of the band around the line: fewer would not determine a swing
 _MOST_SWING = 0.04  # of the speed to either side
 _LEFT = 0.15  # the power that parts may then still have over that of the whole: the swing holds in all of the hop
 _SWING_SIZES, _SWING_PHASES = np.linspace(0.125, 1.0, 8), np.arange(16) * np.pi / 8
@@ -149,13 +150,14 @@ def _swinging(
         return power, float(np.mean([abs(part.mean()) ** 2 for part in np.array_split(along, _PARTS)])) - 1
 
     power, lost = power_and_lost(seen(line.angle(t_s)))
-    if lost < (max(_SPREAD, _OF_NOISE / 2 / line.strength) if line.strength > STRONG else _SPREAD_OF_WEAK):
+    near_hz = grid_hz[np.abs(2 * np.pi * grid_hz - line.speed_rad_s) <= 2 * np.pi * most_hz][::2]
+    least = max(_SPREAD, _OF_NOISE / 2 / line.strength) if line.strength > STRONG else _SPREAD_OF_WEAK
+    if lost < least or not near_hz.size or t_s.size < _FEWEST_SAMPLES:
         return line
     duration_s = float(t_s[1] - t_s[0]) * t_s.size
-    near_hz = grid_hz[np.abs(2 * np.pi * grid_hz - line.speed_rad_s) <= 2 * np.pi * most_hz][::2]
     tones = np.exp(2j * np.pi * (base_hz - near_hz)[:, None] * t_s)
     tried = []
-    for swings in _SWINGS:
+    for swings in (one for one in _SWINGS if one * _SAMPLES_OF_A_SWING <= t_s.size):
         rate = 2 * np.pi * swings / duration_s
         size = 2 * np.pi * most_hz / rate * _SWING_SIZES
         swing = (size[:, None, None] * np.sin(rate * t_s + _SWING_PHASES[:, None])).reshape(-1, t_s.size)

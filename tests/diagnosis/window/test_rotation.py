@@ -106,6 +106,16 @@ def test_a_speed_that_hunts_is_followed_within_a_hop(part: float, every_s: float
     assert settled_hops(tuple(found), speeds, HOP_S).all()
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.003, 0.02, 0.05])
+@pytest.mark.parametrize("size", [600, 1500, 3750, 3751])
+def test_a_narrow_band_is_searched_as_far_as_it_goes(tolerance: float, size: int) -> None:
+    """In a band of few samples, a swing would not be determined."""
+    channels, _ = hunting(0.03, 5.0)
+    for shaft_hz in (1.5, SHAFT_HZ, 200.0):
+        line = rotation_line(channels[:, :size], RATE_HZ, 2 * np.pi * shaft_hz, tolerance)
+        assert line is None or np.isfinite(line.angle(np.linspace(-1.0, 1.0, 5))).all()
+
+
 def test_a_steady_speed_does_not_swing() -> None:
     """However strong its line is."""
     for snr in (0.3, 0.5, 1.0, 10.0):
