@@ -8,7 +8,7 @@ rotor that is known, too, as the unbalance in its file is only an assumption.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,8 +76,9 @@ def identify(
     """
     tried: list[Machine] = []
     failures: list[EstimationError] = []
+    by_forces: dict[str, float] = {} if machine.rotor is None else _from_forces(machine.rotor.m2_kg, windows)
     for start in _STARTS:
-        guess = in_sense(_first_guess(machine, windows, start), sense)
+        guess = in_sense(_first_guess(machine, windows, start, by_forces), sense)
         if guess in tried:  # the file or the relation of bearing and disc gives what the starts differ in
             continue
         tried.append(guess)
@@ -224,7 +225,9 @@ def _moved(
     return balanced, [fit.balanced(balanced, window, diagnosis) for (fit, diagnosis), window in pairs]
 
 
-def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], start: _Start) -> Machine:
+def _first_guess(
+    machine: MachineFile, windows: Sequence[WindowStatistics], start: _Start, by_forces: Mapping[str, float]
+) -> Machine:
     """First guess of every parameter: from the file, the relation of bearing and disc, or the strongest peak."""
     known = machine.rotor
     if known is None or known.m2_kg is None or known.m1_kg is None:
@@ -237,7 +240,7 @@ def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics], star
     spread = max((abs(one / speed - 1) for one in speeds), default=0.0)
     tolerance = max(_LEAST_TOLERANCE, 1.5 * spread)
     operation = machine.operation or Operation(speed_rpm=speed * 30 / math.pi, speed_tolerance=tolerance)
-    guesses = {"e_m": _first_e(windows), **_from_forces(known.m2_kg, windows)}
+    guesses = {"e_m": _first_e(windows), **by_forces}
     given: dict[str, float] = known.model_dump(exclude_none=True)
     if "k_by_N_per_m" not in guesses or "k_bz_N_per_m" not in guesses:
         guesses |= _from_peak({**guesses, **given}, windows, start[2:])
@@ -257,8 +260,10 @@ def _first_e(windows: Sequence[WindowStatistics]) -> float:
     return float(np.clip(np.median(sizes), 1e-7, 1e-3)) if sizes else 1e-6
 
 
-def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str, float]:
+def _from_forces(m2_kg: float | None, windows: Sequence[WindowStatistics]) -> dict[str, float]:
     """Stiffness and damping from the relation of bearing and disc, whose first coefficients are -c/k and -m2/k."""
+    if m2_kg is None:
+        return {}
     try:
         baseline = learn_baseline([window.without_lines for window in windows])
     except EstimationError:
