@@ -64,6 +64,8 @@ def without_pulses(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: 
     if keyphasor.column is None:
         return ""
     found = [piece.samples for piece in _pulse_signal(source, keyphasor, clock, mapping)]
+    if not found:
+        return "; the signal holds no numbers"
     return (
         f"; the signal goes from {min(map(np.nanmin, found)):.6g} to {max(map(np.nanmax, found)):.6g}, "
         f"threshold = {keyphasor.threshold:g}, hysteresis = {keyphasor.hysteresis:g}"

@@ -221,6 +221,15 @@ def test_a_signal_without_pulses_is_refused_with_its_range(tmp_path: Path, edge:
         imported(tmp_path, source, mapping)
 
 
+@pytest.mark.parametrize("mode", ["missing", "gap"])
+def test_a_keyphasor_signal_without_numbers_is_refused(tmp_path: Path, mode: str) -> None:
+    _, x, v, _ = signals(1000)
+    source = archive(tmp_path, x=x, v=v, k=np.full(1000, np.nan))
+    mapping = PULSES.replace("[time]\n", f'[time]\nnot_finite = "{mode}"\n') + 'column = "k"\nthreshold = 0.5\n'
+    with pytest.raises(MachineFileError, match="keyphasor column k: 0 pulses, .*; the signal holds no numbers"):
+        imported(tmp_path, source, mapping)
+
+
 @pytest.mark.parametrize("marks", [1, 4])
 def test_lost_pulses_are_reported_with_what_they_cost(tmp_path: Path, marks: int) -> None:
     time, x, v, _ = signals(8000)
