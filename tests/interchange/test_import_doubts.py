@@ -226,7 +226,7 @@ def test_a_keyphasor_signal_without_numbers_is_refused(tmp_path: Path, mode: str
     _, x, v, _ = signals(1000)
     source = archive(tmp_path, x=x, v=v, k=np.full(1000, np.nan))
     mapping = PULSES.replace("[time]\n", f'[time]\nnot_finite = "{mode}"\n') + 'column = "k"\nthreshold = 0.5\n'
-    with pytest.raises(MachineFileError, match="keyphasor column k: 0 pulses, .*; the signal holds no numbers"):
+    with pytest.raises(MachineFileError, match=r"keyphasor column k: 0 pulses, .*; the signal holds no numbers"):
         imported(tmp_path, source, mapping)
 
 
