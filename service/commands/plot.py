@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,8 +14,10 @@ from models.errors import MachineFileError
 from service.commands.running import Commands, FromOption, ToOption, finite, prepare_numerics
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from service.analysis.figures.spectrum import Lines
-    from service.analysis.figures.style import Paint
+    from service.analysis.figures.style import Look
     from service.analysis.past import Past
     from service.analysis.recorded import Recorded
 
@@ -144,11 +147,12 @@ class _Picture:
 
         return Past.find(self.history, self.key, (self.from_, self.to))
 
-    def draw(self, paint: "Paint") -> None:
-        from service.analysis.figures.style import Look, draw  # noqa: PLC0415
+    @property
+    def look(self) -> "Look":
+        """Options that concern the picture itself."""
+        from service.analysis.figures.style import Look  # noqa: PLC0415
 
-        draw(self.out, Look(self.title, self._inches(), self.dpi), paint)
-        typer.echo(str(self.out))
+        return Look(self.title, self._inches(), self.dpi)
 
     def _inches(self) -> tuple[float, float] | None:
         if self.size is None:
@@ -160,7 +164,7 @@ class _Picture:
         return width, height
 
 
-def _kind(paint: Callable[..., "Paint"]) -> None:
+def _kind(paint: Callable[..., "Figure"]) -> None:
     """Add a command for a kind of picture: the common options, passed as one `_Picture`, and its own."""
     shared = signature(_Picture).parameters
 
@@ -168,7 +172,10 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
         prepare_numerics()
         picture = _Picture(**{name: given.pop(name) for name in shared})
         picture.check()
-        picture.draw(paint(picture, **given))
+        from service.analysis.figures.style import draw  # noqa: PLC0415
+
+        draw(picture.out, picture.look, partial(paint, picture, **given))
+        typer.echo(str(picture.out))
 
     (files, out, *others), (_, *own) = shared.values(), signature(paint).parameters.values()
     options = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in (files, out, *own, *others)]
@@ -191,11 +198,11 @@ def trend(
     levels: Annotated[
         bool, typer.Option("--levels", help="Vibration levels and their limits, even where parameters were read.")
     ] = False,
-) -> "Paint":
+) -> "Figure":
     """Every parameter's change with its 95 % interval over time, or vibration levels; state, alarms and speed."""
     from service.analysis.figures.trend import trend as read  # noqa: PLC0415
 
-    return read(picture.known(reports=True), machine, levels=levels)
+    return read(picture.look, picture.known(reports=True), machine, levels=levels)
 
 
 @_kind
@@ -211,11 +218,11 @@ def correlation(
             "recorded site and name.",
         ),
     ] = None,
-) -> "Paint":
+) -> "Figure":
     """Correlations of one window against what the networks predict, equation by equation."""
     from service.analysis.figures.correlation import correlation as read  # noqa: PLC0415
 
-    return read(picture.recorded(at), machine)
+    return read(picture.look, picture.recorded(at), machine)
 
 
 @_kind
@@ -223,11 +230,11 @@ def orbit(
     picture: _Picture,
     at: _AtOption = None,
     revolutions: Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many.")] = 8,
-) -> "Paint":
+) -> "Figure":
     """The shaft's path at bearing and disc, as measured and at running speed alone."""
     from service.analysis.figures.samples import orbit as read  # noqa: PLC0415
 
-    return read(picture.recorded(at), revolutions)
+    return read(picture.look, picture.recorded(at), revolutions)
 
 
 @_kind
@@ -242,12 +249,12 @@ def spectrum(
         Literal["log", "linear"] | None, typer.Option("--scale", help="Linear for amplitudes, log for densities.")
     ] = None,
     to_hz: _ToHzOption = None,
-) -> "Paint":
+) -> "Figure":
     """Amplitudes or power spectral density of channels, 1× and 2× marked."""
     from service.analysis.figures.spectrum import spectrum as read  # noqa: PLC0415
 
     lines = _lines(window, resolution, to_hz, density=density, log=density if scale is None else scale == "log")
-    return read(picture.recorded(at), channel or (), lines)
+    return read(picture.look, picture.recorded(at), channel or (), lines)
 
 
 @_kind
@@ -269,13 +276,13 @@ def waterfall(
     to_hz: _ToHzOption = None,
     axis: Annotated[Literal["time", "speed"], typer.Option("--axis", help="Over time, or over the speed.")] = "time",
     cascade: Annotated[bool, typer.Option("--cascade", help="Lines instead of colours.")] = False,
-) -> "Paint":
+) -> "Figure":
     """Spectra of one channel over time, or over speed in a run-up."""
     from service.analysis.figures.spectrum import waterfall as read  # noqa: PLC0415
 
     log = density or not cascade if scale is None else scale == "log"
     lines = _lines(window, resolution, to_hz, density=density, log=log)
-    return read(picture.recorded(), channel or (), lines, over_speed=axis == "speed", cascade=cascade)
+    return read(picture.look, picture.recorded(), channel or (), lines, over_speed=axis == "speed", cascade=cascade)
 
 
 @_kind
@@ -286,12 +293,12 @@ def waveform(
     window: Annotated[
         float | None, typer.Option("--window", metavar="S", help="Seconds shown; as long as 8 revolutions if left out.")
     ] = None,
-) -> "Paint":
+) -> "Figure":
     """Samples of channels over time, with the keyphasor's pulses."""
     from service.analysis.figures.samples import waveform as read  # noqa: PLC0415
 
     _positive("--window", window)
-    return read(picture.recorded(at), channel or (), window)
+    return read(picture.look, picture.recorded(at), channel or (), window)
 
 
 @_kind
@@ -306,12 +313,12 @@ def full_spectrum(
     axis: Annotated[
         Literal["hz", "orders"], typer.Option("--axis", help="Frequencies, or multiples of running speed.")
     ] = "hz",
-) -> "Paint":
+) -> "Figure":
     """Forward and reverse precession of the shaft at a place, from its displacements in y and z."""
     from service.analysis.figures.spectrum import full_spectrum as read  # noqa: PLC0415
 
     lines = _lines(window, resolution, to_hz, density=False, log=scale == "log")
-    return read(picture.recorded(at), place, lines, orders=axis == "orders")
+    return read(picture.look, picture.recorded(at), place, lines, orders=axis == "orders")
 
 
 @_kind
@@ -323,13 +330,13 @@ def centreline(
         float | None,
         typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, start at the bottom."),
     ] = None,
-) -> "Paint":
+) -> "Figure":
     """Mean position of the shaft across the bearing, from gaps in y and z, over speed or time."""
     from service.analysis.figures.run_up import centreline as read  # noqa: PLC0415
 
     _positive("--window", window)
     _positive("--clearance", clearance)
-    return read(picture.known(), place, window, clearance)
+    return read(picture.look, picture.known(), place, window, clearance)
 
 
 @_kind
@@ -345,11 +352,11 @@ def bode(
             "--speeds", metavar="RPM-RPM", help="Without a keyphasor: range to search for the speed. Gives no phase."
         ),
     ] = None,
-) -> "Paint":
+) -> "Figure":
     """Amplitude and phase lag of 1x over the speed, from a run-up or coast-down."""
     from service.analysis.figures.run_up import bode as read  # noqa: PLC0415
 
-    return read(picture.known(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
+    return read(picture.look, picture.known(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
 
 
 @_kind
@@ -359,11 +366,11 @@ def polar(
     order: _OrderOption = 1,
     revolutions: _EachOption = 16,
     slow_roll: _SlowRollOption = None,
-) -> "Paint":
+) -> "Figure":
     """Amplitude and phase lag of 1x as vectors in the plane, with speeds; the lag counts against the rotation."""
     from service.analysis.figures.run_up import polar as read  # noqa: PLC0415
 
-    return read(picture.known(), channel or (), order, revolutions, slow_roll)
+    return read(picture.look, picture.known(), channel or (), order, revolutions, slow_roll)
 
 
 def _lines(window_s: float, resolution_hz: float, to_hz: float | None, *, density: bool, log: bool) -> "Lines":

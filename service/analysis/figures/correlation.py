@@ -1,22 +1,22 @@
 """Picture of correlation functions: measured and predicted by the networks, with the residual below."""
 
-from functools import partial
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import MachineFileError
 from service.analysis.correlation import Panel, correlations_of, latest_window
-from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm
+from service.analysis.figures.style import COLOURS, GREY, INK, Look, heading, rpm
 from service.analysis.recorded import Recorded
 from service.recordings.replay.offline import choose_machine
 
 
-def correlation(data: Recorded, choice: str | None) -> Paint:
-    """Correlation functions of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``."""
+def correlation(look: Look, data: Recorded, choice: str | None) -> Figure:
+    """Correlation functions of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``.
+
+    There are two panels for each equation.
+    """
     installed = choose_machine(data.keys, choice)
     machine, bundle = installed.known, installed.bundle
     if machine is None or bundle is None:
@@ -25,11 +25,7 @@ def correlation(data: Recorded, choice: str | None) -> Paint:
             "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
         )
     window = latest_window(data, machine)
-    return partial(_paint, window, correlations_of(window, machine, bundle), data.name, bundle.identity)
-
-
-def _paint(window: WindowStatistics, panels: tuple[Panel, ...], name: str, networks: str, look: Look) -> Figure:
-    """Draw two panels for each equation."""
+    panels = correlations_of(window, machine, bundle)
     figure = Figure(figsize=look.size_in or (11.0, 8.4))
     figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)
     rows = (len(panels) + 1) // 2
@@ -52,8 +48,8 @@ def _paint(window: WindowStatistics, panels: tuple[Panel, ...], name: str, netwo
         loc="outside lower center",
         ncols=2,
     )
-    title, span = f"{name}: correlations against the networks' prediction", (window.start_ns, window.end_ns)
-    heading(figure, look, title, span, rpm(window.speed_rad_s), f"networks {networks}")
+    title, span = f"{data.name}: correlations against the networks' prediction", (window.start_ns, window.end_ns)
+    heading(figure, look, title, span, rpm(window.speed_rad_s), f"networks {bundle.identity}")
     return figure
 
 

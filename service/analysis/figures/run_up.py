@@ -5,7 +5,6 @@ is at the sensor, and the lag is counted against the rotation, so that angles on
 """
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +22,6 @@ from service.analysis.figures.style import (
     GREY,
     PLATE,
     Look,
-    Paint,
     along_path,
     frame_plane,
     heading,
@@ -35,7 +33,7 @@ from service.analysis.figures.style import (
 from service.analysis.orbit import planes_of, recorded_pairs
 from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.runup import Centreline, RunUp, read_centreline, read_run_up
+from service.analysis.runup import RunUp, read_centreline, read_run_up
 from service.analysis.spectrum import steady
 
 _APART = 0.16
@@ -43,30 +41,18 @@ _APART = 0.16
 
 
 def bode(
+    look: Look,
     data: Recorded | Past,
     channels: Sequence[str],
     order: int,
     revolutions: int,
     slow_roll_rpm: float | None,
     between_rpm: tuple[float, float] | None = None,
-) -> Paint:
-    """Amplitude and phase lag of one order over speed."""
+) -> Figure:
+    """Amplitude of one order over speed and, where there is one, the phase lag above it, channel by channel."""
     found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm, between_rpm)
     if text := steady(found.speed_rad_s):
         raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
-    return partial(_paint_bode, found, data.name)
-
-
-def polar(
-    data: Recorded | Past, channels: Sequence[str], order: int, revolutions: int, slow_roll_rpm: float | None
-) -> Paint:
-    """Vectors of one order in the polar plane, with points labelled by speed or time."""
-    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
-    return partial(_paint_polar, found, data.name)
-
-
-def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
-    """Draw for each channel the phase lag above, if there is one, and the amplitude below."""
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
     figure = Figure(figsize=look.size_in or (5.6 * columns if columns > 1 else 8.0, 0.8 + 4.4 * rows))
@@ -97,7 +83,7 @@ def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
             f"greatest: {amplitude[top]:.3g} {found.units[number]} at {speed[top]:.0f} rpm{text}",
             loc="right", color=COLOURS[1],
         )  # fmt: skip
-    _heading(figure, look, found, f"{name}: Bode plot of {found.order}×")
+    _heading(figure, look, found, f"{data.name}: Bode plot of {found.order}×")
     return figure
 
 
@@ -122,7 +108,16 @@ def _cut_deg(lag_deg: FloatArray, amplitude: FloatArray) -> float:
     return 10.0 * (int(np.argmin(near)) + 0.5)
 
 
-def _paint_polar(found: RunUp, name: str, look: Look) -> Figure:
+def polar(
+    look: Look,
+    data: Recorded | Past,
+    channels: Sequence[str],
+    order: int,
+    revolutions: int,
+    slow_roll_rpm: float | None,
+) -> Figure:
+    """Vectors of one order in the polar plane, with points labelled by speed or time."""
+    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
     figure = Figure(figsize=look.size_in or (max(8.0, 5.2 * columns), 0.9 + 5.6 * rows))
@@ -138,7 +133,7 @@ def _paint_polar(found: RunUp, name: str, look: Look) -> Figure:
         axes.set_thetagrids(range(0, 360, 45), ["0°\nsensor", *(f"{one}°" for one in range(45, 360, 45))])
     for axes in panels[len(found.channels) :]:
         axes.remove()
-    _heading(figure, look, found, f"{name}: polar plot of {found.order}×")
+    _heading(figure, look, found, f"{data.name}: polar plot of {found.order}×")
     return figure
 
 
@@ -180,13 +175,11 @@ def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
     heading(figure, look, title, span, speeds_text(found.speed_rad_s), points, slow_roll, turns)
 
 
-def centreline(data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
+def centreline(
+    look: Look, data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None
+) -> Figure:
     """Mean positions of the shaft at pairs of probes, relative to the first one."""
-    pairs = recorded_pairs(data, place)
-    return partial(_paint_centreline, read_centreline(data, pairs, each_s), data.name, clearance_um)
-
-
-def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, look: Look) -> Figure:
+    found = read_centreline(data, recorded_pairs(data, place), each_s)
     columns = len(found.pairs)
     figure = Figure(figsize=look.size_in or (max(7.2, 5.4 * columns), 6.2), layout="constrained")
     every, unit = along_path(found.speed_rad_s, found.time_ns)
@@ -213,7 +206,7 @@ def _paint_centreline(found: Centreline, name: str, clearance_um: float | None, 
     bar = figure.colorbar(lines, ax=list(panels), pad=0.02, aspect=32, shrink=0.9)
     bar.set_label(unit)
     span, text = (int(found.time_ns[0]), int(found.time_ns[-1])), f"means over {found.each_s:.3g} s"
-    heading(figure, look, f"{name}: shaft centreline", span, speeds_text(found.speed_rad_s), text)
+    heading(figure, look, f"{data.name}: shaft centreline", span, speeds_text(found.speed_rad_s), text)
     return figure
 
 

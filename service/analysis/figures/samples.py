@@ -1,7 +1,6 @@
 """Pictures of samples: waveforms over time, and orbits, unfiltered and at 1x, both with keyphasor pulses marked."""
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,20 +9,10 @@ from matplotlib.lines import Line2D
 
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.channels import Channel
-from service.analysis.figures.style import (
-    COLOURS,
-    GREY,
-    Look,
-    Paint,
-    frame_plane,
-    heading,
-    place_text,
-    rotation_text,
-    rpm,
-)
+from service.analysis.figures.style import COLOURS, GREY, Look, frame_plane, heading, place_text, rotation_text, rpm
 from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
-from service.analysis.revolutions import Excerpt, pulses
+from service.analysis.revolutions import pulses
 from service.analysis.spectrum import unit_shown
 
 _REVOLUTIONS = 8
@@ -33,11 +22,11 @@ _BLANK = 0.07
 """Gap before the keyphasor dot, as a fraction of the ellipse's long axis."""
 
 
-def waveform(data: Recorded, channels: Sequence[str], window_s: float | None) -> Paint:
-    """The latest samples of channels; without `window_s`, over 8 revolutions."""
-    chosen = data.chosen(channels)
-    length_s = window_s or _usual_s(data, chosen)
-    found = data.latest(chosen, length_s + _SOON_S)
+def waveform(look: Look, data: Recorded, names: Sequence[str], window_s: float | None) -> Figure:
+    """The latest samples of channels, each about its mean; without `window_s`, over 8 revolutions."""
+    channels = data.chosen(names)
+    length_s = window_s or _usual_s(data, channels)
+    found = data.latest(channels, length_s + _SOON_S)
     if not found:
         raise RotorwatchError(f"{data.place}: no sample blocks of {data.name} in this stretch of time")
     if length_s * found[-1].rate_hz < 2:
@@ -46,19 +35,7 @@ def waveform(data: Recorded, channels: Sequence[str], window_s: float | None) ->
         )
     begin_ns = found[-1].end_ns - round(length_s * 1e9)
     cut = [one.part(max(0, round((begin_ns - one.start_ns) / 1e9 * one.rate_hz)), len(one.samples)) for one in found]
-    return partial(_paint_waveforms, [one for one in cut if len(one.samples)], chosen, data.name)
-
-
-def _usual_s(data: Recorded, chosen: Sequence[Channel]) -> float:
-    """Duration of 8 revolutions, or 0.5 s if fewer than two keyphasor pulses are found."""
-    marked = [pulses(stretch.angle_rad)[1] / stretch.rate_hz for stretch in data.latest(chosen[:1], _SOON_S)[-1:]]
-    if not marked or marked[0].size < 2:
-        return _USUAL_S
-    return _REVOLUTIONS * float(marked[0][-1] - marked[0][-2])
-
-
-def _paint_waveforms(found: Sequence[Excerpt], channels: Sequence[Channel], name: str, look: Look) -> Figure:
-    """Draw a panel for each channel, with the mean subtracted and stated in the title."""
+    found = [one for one in cut if len(one.samples)]
     figure = Figure(figsize=look.size_in or (9.5, 1.3 + 1.6 * len(channels)), layout="constrained")
     panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     start_ns = found[0].start_ns
@@ -92,17 +69,21 @@ def _paint_waveforms(found: Sequence[Excerpt], channels: Sequence[Channel], name
     lengths = [stretch.length_s for stretch in found]
     speed_rad_s = float(np.average([stretch.speed_rad_s for stretch in found], weights=lengths))
     span, text = (start_ns, found[-1].end_ns), f"{found[0].rate_hz:g} samples per second"
-    heading(figure, look, f"{name}: waveform", span, rpm(speed_rad_s), text)
+    heading(figure, look, f"{data.name}: waveform", span, rpm(speed_rad_s), text)
     return figure
 
 
-def orbit(data: Recorded, revolutions: int) -> Paint:
-    """Orbits of the latest revolutions."""
-    return partial(_paint_orbits, read_orbits(data, revolutions), data.name)
+def _usual_s(data: Recorded, channels: Sequence[Channel]) -> float:
+    """Duration of 8 revolutions, or 0.5 s if fewer than two keyphasor pulses are found."""
+    marked = [pulses(stretch.angle_rad)[1] / stretch.rate_hz for stretch in data.latest(channels[:1], _SOON_S)[-1:]]
+    if not marked or marked[0].size < 2:
+        return _USUAL_S
+    return _REVOLUTIONS * float(marked[0][-1] - marked[0][-2])
 
 
-def _paint_orbits(found: Orbits, name: str, look: Look) -> Figure:
-    """Draw a row for each location: unfiltered, and 1×."""
+def orbit(look: Look, data: Recorded, revolutions: int) -> Figure:
+    """Orbits of the latest revolutions, a row for each location: unfiltered, and 1×."""
+    found = read_orbits(data, revolutions)
     rows = len(found.orbits)
     figure = Figure(figsize=look.size_in or (7.6, 1.0 + 4.2 * rows), layout="constrained")
     for row, orbit in zip(figure.subplots(rows, 2, squeeze=False), found.orbits, strict=True):
@@ -111,8 +92,8 @@ def _paint_orbits(found: Orbits, name: str, look: Look) -> Figure:
     text = "keyphasor pulse (on 1×, the gap comes before it)"
     pulse = Line2D([], [], marker="o", linestyle="", color=COLOURS[1], label=text)
     figure.legend(handles=[pulse], loc="outside lower center")
-    span, turns = (found.start_ns, found.end_ns), rotation_text(found.direction)
-    heading(figure, look, f"{name}: orbits of {found.revolutions} revolutions", span, rpm(found.speed_rad_s), turns)
+    span, title = (found.start_ns, found.end_ns), f"{data.name}: orbits of {found.revolutions} revolutions"
+    heading(figure, look, title, span, rpm(found.speed_rad_s), rotation_text(found.direction))
     return figure
 
 

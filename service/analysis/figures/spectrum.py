@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -12,13 +11,11 @@ from matplotlib.figure import Figure
 
 from models.errors import MachineFileError
 from models.signals.channels import Channel
-from rotorwatch.records.alarms import AlarmEventData
 from service.analysis.figures.style import (
     COLOURS,
     INK,
     PLATE,
     Look,
-    Paint,
     alarm_lines,
     as_dates,
     heading,
@@ -66,23 +63,9 @@ class Lines:
             )
 
 
-def spectrum(data: Recorded, channels: Sequence[str], lines: Lines) -> Paint:
+def spectrum(look: Look, data: Recorded, channels: Sequence[str], lines: Lines) -> Figure:
     """Spectra of the latest seconds; without names, of all channels of the first quantity measured."""
     found = read_spectrum(data, data.chosen(channels), lines.window_s, lines.resolution_hz, lines.scaling)
-    return lambda look: paint_spectrum(found, data.name, look, lines)
-
-
-def waterfall(data: Recorded, channels: Sequence[str], lines: Lines, *, over_speed: bool, cascade: bool) -> Paint:
-    """Spectra of one channel (without a name, the first displacement) over time or speed, as colours or lines."""
-    if len(channels) > 1:
-        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(channels)}")
-    found = read_waterfall(data, data.chosen(channels)[0], lines.window_s, lines.resolution_hz, lines.scaling)
-    alarms = recorded_alarms(data)
-    return lambda look: paint_waterfall(found, data.name, look, alarms, lines, over_speed=over_speed, cascade=cascade)
-
-
-def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figure:
-    """Draw a panel for each channel."""
     count = len(found.channels)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
@@ -96,23 +79,19 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
         _orders(axes, found, values, frequency, channel)
     panels[-1].set_xlim(limits_hz)
     panels[-1].set_xlabel("frequency, Hz")
-    title = f"{name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum")
+    title = f"{data.name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum")
     text = f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages"
     heading(figure, look, title, (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
     return figure
 
 
-def paint_waterfall(
-    found: Waterfall,
-    name: str,
-    look: Look,
-    alarms: tuple[AlarmEventData, ...],
-    lines: Lines,
-    *,
-    over_speed: bool,
-    cascade: bool,
+def waterfall(
+    look: Look, data: Recorded, channels: Sequence[str], lines: Lines, *, over_speed: bool, cascade: bool
 ) -> Figure:
-    """Draw spectra as a colour map, or as a cascade of lines."""
+    """Spectra of one channel (without a name, the first displacement) over time or speed, as colours or lines."""
+    if len(channels) > 1:
+        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(channels)}")
+    found = read_waterfall(data, data.chosen(channels)[0], lines.window_s, lines.resolution_hz, lines.scaling)
     figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), dpi=look.dpi, layout="constrained")
     axes = figure.subplots()
     limits_hz, shown = _line_limits(found, lines.to_hz)
@@ -124,8 +103,8 @@ def paint_waterfall(
         axes.set_ylabel("speed, rpm")
     else:
         time_axis(axes, vertical=True)
-        alarm_lines(axes, alarms, vertical=True)
-    title = f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}"
+        alarm_lines(axes, recorded_alarms(data), vertical=True)
+    title = f"{data.name}: spectra of {found.channel.name}, {place_text(found.channel)}"
     text = f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann"
     span = int(found.start_ns[0]), int(found.end_ns[-1])
     heading(figure, look, title, span, speeds_text(found.speed_rad_s), text)
@@ -280,14 +259,10 @@ def _heights(axes: Axes, values: np.ndarray, depth: float | None, room: float) -
     axes.set_ylim(0.7 * max(float(values[values > 0].min(initial=top)), depth * top), 2.5 * top)
 
 
-def full_spectrum(data: Recorded, place: str | None, lines: Lines, *, orders: bool) -> Paint:
+def full_spectrum(look: Look, data: Recorded, place: str | None, lines: Lines, *, orders: bool) -> Figure:
     """Full spectra of pairs of probes in the latest seconds."""
     pairs = recorded_pairs(data, place)
     found = read_full_spectrum(data, pairs, lines.window_s, lines.resolution_hz, orders=orders)
-    return partial(_paint_full, found, data.name, lines)
-
-
-def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Figure:
     count = len(found.pairs)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 2.4 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
@@ -310,7 +285,7 @@ def _paint_full(found: FullSpectrum, name: str, lines: Lines, look: Look) -> Fig
     panels[-1].set_xlim(-to, to)
     panels[-1].set_xlabel("order" if found.orders else "frequency, Hz")
     text = f"{found.resolution:.3g} {'orders' if found.orders else 'Hz'}, Hann, {found.averages} averages"
-    heading(figure, look, f"{name}: full spectrum", (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
+    heading(figure, look, f"{data.name}: full spectrum", (found.start_ns, found.end_ns), rpm(found.speed_rad_s), text)
     return figure
 
 

@@ -74,14 +74,11 @@ class Look:
     dpi: float = 120.0  # pixels per inch of a PNG
 
 
-Paint = Callable[[Look], Figure]
-"""Draws data already read; functions that return a `Paint` raise `RotorwatchError` if there is nothing to draw."""
-
-
-def draw(path: Path, look: Look, paint: Paint) -> None:
+def draw(path: Path, look: Look, picture: Callable[[], Figure]) -> None:
     """Draw in the house style, independent of the user's matplotlib settings, and write as PNG or SVG by suffix.
 
-    The file contains neither the time nor the program that made it.
+    The file contains neither the time nor the program that made it. `picture` reads the data and draws them; it raises
+    `RotorwatchError` if there is nothing to draw.
 
     Raises
     ------
@@ -89,7 +86,7 @@ def draw(path: Path, look: Look, paint: Paint) -> None:
         If the file cannot be written.
     """
     with style.context(["default", _STYLE]):
-        figure = paint(look)
+        figure = picture()
         as_svg = path.suffix.lower() == ".svg"
         engine = figure.get_layout_engine()
         if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout

@@ -1,7 +1,5 @@
 """Picture of a trend: a strip with the machine's state, and below it a panel for every parameter, level and measure."""
 
-from functools import partial
-
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -22,7 +20,6 @@ from service.analysis.figures.style import (
     SEVERITY_COLOURS,
     STATE_COLOURS,
     Look,
-    Paint,
     alarm_lines,
     alarm_text,
     as_date,
@@ -41,16 +38,16 @@ _LETTER_IN, _ROW_PT = 0.065, 11.0
 """Width of a letter in small print, in inches, and its line spacing, in points."""
 
 
-def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
+def trend(look: Look, data: Recorded | Past, machine: str | None, *, levels: bool) -> Figure:
     """Parameters or levels over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
     if isinstance(data, Recorded):
-        return partial(paint_trend, read_trend(data, machine, levels=levels))
+        return paint_trend(look, read_trend(data, machine, levels=levels))
     if machine is not None:
         raise MachineFileError("--machine needs samples: name recordings instead of --history")
-    return partial(paint_trend, past_trend(data, levels=levels))
+    return paint_trend(look, past_trend(data, levels=levels))
 
 
-def paint_trend(trend: TrendSeries, look: Look) -> Figure:
+def paint_trend(look: Look, trend: TrendSeries) -> Figure:
     """Draw all panels over one time axis."""
     count = len(trend.parameters)
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]

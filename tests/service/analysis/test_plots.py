@@ -20,7 +20,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
 from rotorwatch.records.levels import LevelLimits
 from service.analysis.correlation import correlations_of, latest_window
-from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
+from service.analysis.figures.spectrum import Lines, spectrum, waterfall
 from service.analysis.figures.style import Look, draw
 from service.analysis.figures.trend import paint_trend
 from service.analysis.orbit import read_orbits
@@ -105,7 +105,7 @@ def test_a_sine_reads_its_amplitude_in_the_quantitys_unit_within_scalloping(
     assert (found.start_ns, found.end_ns) == (START_NS + 1 * S, START_NS + 21 * S)
     density = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "density")
     assert density.values[0].sum() * 0.5 == pytest.approx(amplitude**2 / 2, rel=1e-3)
-    panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=False)).axes[0]
+    panel = spectrum(Look(), stream, [name], Lines(20.0, 0.5, "amplitude", log=False)).axes[0]
     assert panel.get_ylabel() == stated
     fall = read_waterfall(stream, stream.channels([name])[0], 4.0, 0.5, "amplitude")
     assert fall.values.max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
@@ -130,19 +130,17 @@ def test_axes_of_spectra_cover_the_harmonics_and_not_drift(tmp_path: Path) -> No
         "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
     }
     stream = made(tmp_path, signals, 30.0)
-    found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
-    fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     for log in (False, True):
-        panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log)).axes[0]
+        panel = spectrum(Look(), stream, ["y1"], Lines(20.0, 0.5, "amplitude", log)).axes[0]
         assert panel.get_xlim() == (1.0, 80.0)  # from two lines, where the window passes no mean, to 4×
         assert panel.get_ylim()[1] > 20
-    low, high = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=True)).axes[0].get_ylim()
+    low, high = spectrum(Look(), stream, ["y1"], Lines(20.0, 0.5, "amplitude", log=True)).axes[0].get_ylim()
     assert high / low < 10**5
     lines = Lines(4.0, 0.5, "amplitude", log=True)
     for cascade in (False, True):
-        axes = paint_waterfall(fall, "demo/lab", Look(), (), lines, over_speed=False, cascade=cascade).axes[0]
+        axes = waterfall(Look(), stream, ["y1"], lines, over_speed=False, cascade=cascade).axes[0]
         assert axes.get_xlim() == (1.0, 80.0)
-    wide = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", False, 500.0)).axes[0]
+    wide = spectrum(Look(), stream, ["y1"], Lines(20.0, 0.5, "amplitude", False, 500.0)).axes[0]
     assert wide.get_xlim() == (1.0, 500.0)
 
 
@@ -151,14 +149,10 @@ def test_every_line_of_a_wide_band_is_visible_in_a_waterfall(tmp_path: Path) -> 
     tones_hz = np.arange(60.0, 760.0, 70.5)
     signals = {"y1": lambda t: np.sin(2 * np.pi * tones_hz[:, None] * t).sum(axis=0)}
     stream = made(tmp_path, signals, 12.0)
-    fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     lines = Lines(4.0, 0.5, "amplitude", log=True)
     picture = tmp_path / "fall.png"
-    draw(
-        picture,
-        Look(size_in=(3.0, 2.5)),
-        lambda look: paint_waterfall(fall, "x", look, (), lines, over_speed=False, cascade=False),
-    )
+    look = Look(size_in=(3.0, 2.5))
+    draw(picture, look, lambda: waterfall(look, stream, ["y1"], lines, over_speed=False, cascade=False))
     pixels = imread(picture)
     map_only = pixels[pixels.shape[0] // 2, : round(0.75 * pixels.shape[1]), :3]  # without the colour bar
     bright = (map_only[:, 0] > 0.8) & (map_only[:, 2] < 0.5)
@@ -310,7 +304,7 @@ def test_names_of_alarms_in_a_trend_do_not_overlap(computed: TrendSeries) -> Non
     event, first_ns = AlarmEventData.model_validate(example(AlarmEventData)), int(computed.end_ns[0])
     named = [("k_by", 1), ("data-gap", 1), ("level:VE-1X", 2), ("level:VE-1Y", 2), ("model", 4), ("stream-lost", 38)]
     alarms = tuple(event.model_copy(update={"name": name, "time_ns": first_ns + at * S}) for name, at in named)
-    figure = paint_trend(replace(computed, alarms=alarms), Look())
+    figure = paint_trend(Look(), replace(computed, alarms=alarms))
     FigureCanvasAgg(figure)
     figure.draw_without_rendering()
     for axes in figure.axes:

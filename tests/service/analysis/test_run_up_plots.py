@@ -60,7 +60,7 @@ def test_labels_of_orders_do_not_overlap_in_a_wide_band(tmp_path: Path) -> None:
     """20 and 40 Hz are ten pixels apart, on either side."""
     circle = {"theta": turning(20.0), "y1": lambda t: np.cos(125.7 * t), "z1": lambda t: np.sin(125.7 * t)}
     data, lines = made(tmp_path, circle, 21.0), Lines(20.0, 0.5, "amplitude", log=False, to_hz=900.0)
-    figures = full_spectrum(data, "bearing", lines, orders=False)(Look()), spectrum(data, ["y1"], lines)(Look())
+    figures = full_spectrum(Look(), data, "bearing", lines, orders=False), spectrum(Look(), data, ["y1"], lines)
     for figure, names in zip(figures, (["1×", "2×", "−1×", "−2×"], ["1×", "2×"]), strict=True):
         FigureCanvasAgg(figure)
         figure.draw_without_rendering()
@@ -73,7 +73,7 @@ def test_labels_of_orders_do_not_overlap_in_a_wide_band(tmp_path: Path) -> None:
 def test_labels_of_a_centreline_that_does_not_move_do_not_overlap(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     noise = {"theta": turning(20.0), **{name: lambda t: rng.normal(0, 0.1, t.size) for name in ("y1", "z1")}}
-    figure = drawn(centreline(made(tmp_path, noise, 60.0), "bearing", 1.0, None))
+    figure = drawn(centreline(Look(), made(tmp_path, noise, 60.0), "bearing", 1.0, None))
     FigureCanvasAgg(figure)
     figure.draw_without_rendering()
     boxes = [one.get_window_extent() for one in figure.axes[0].texts]
@@ -182,8 +182,7 @@ def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, 
     assert far == pytest.approx(20 * r**2 / np.hypot(1 - r**2, 2 * DAMPING * r), rel=0.03)
 
 
-def drawn(paint: Callable[[Look], Figure]) -> Figure:
-    figure = paint(Look())
+def drawn(figure: Figure) -> Figure:
     figure.canvas.draw()
     return figure
 
@@ -192,7 +191,7 @@ def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up
     """At resonance y lags 90°: the high spot is a quarter turn against the rotation from the sensor y."""
     sense, data = run_up
     for name, sensor in (("y2", 0.0), ("z2", np.pi / 2)):
-        axes = drawn(polar(data, [name], 1, 4, None)).axes[0]
+        axes = drawn(polar(Look(), data, [name], 1, 4, None)).axes[0]
         assert isinstance(axes, PolarAxes)
         assert axes.get_theta_offset() == pytest.approx(sensor)
         assert axes.get_theta_direction() == -sense
@@ -206,7 +205,7 @@ def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up
 
 
 def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Recorded]) -> None:
-    lower, upper = drawn(bode(run_up[1], ["y2"], 1, 4, None)).axes
+    lower, upper = drawn(bode(Look(), run_up[1], ["y2"], 1, 4, None)).axes
     assert lower.get_ylabel() == "1× amplitude, µm p-p"
     top, bottom = upper.get_ylim()
     assert top > bottom  # lag grows downwards
@@ -270,7 +269,7 @@ def test_without_a_keyphasor_the_speed_is_tracked_in_the_vibration_without_phase
     assert found.time_ns.size == 30
     assert found.speed_rad_s / (2 * np.pi) == pytest.approx(15 + 0.25 * middle_s, rel=2e-3)
     assert found.amplitude == pytest.approx(40, rel=0.02)
-    figure = drawn(bode(data, ["y2"], 1, 8, None, (600, 2400)))
+    figure = drawn(bode(Look(), data, ["y2"], 1, 8, None, (600, 2400)))
     assert [axes.get_ylabel() for axes in figure.axes] == ["1× amplitude, µm p-p"]
     with pytest.raises(MachineFileError, match="--slow-roll needs phases"):
         read_run_up(data, channels, 1, 8, 500.0, (600, 2400))
@@ -306,7 +305,7 @@ def test_a_centreline_is_the_mean_of_the_gap_readings(tmp_path: Path, keyphasor:
     assert found.y_um[:, 0] == pytest.approx(-400 + middle_s, abs=leaks)
     assert found.z_um[:, 0] == pytest.approx(-600 + 3 * middle_s, abs=leaks)
     assert found.y_um[-4:, 0] == pytest.approx(-400 + middle_s[-4:], abs=0.3 if keyphasor else 2.0)
-    axes, bar = drawn(centreline(data, "bearing", 2.0, 100.0)).axes
+    axes, bar = drawn(centreline(Look(), data, "bearing", 2.0, 100.0)).axes
     if keyphasor:
         assert found.speed_rad_s / (2 * np.pi) == pytest.approx(2.2 + np.arange(1, 20, 2), rel=0.01)
     assert bar.get_ylabel() == ("speed, rpm" if keyphasor else "time after the start, s")
@@ -327,7 +326,7 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
         "y2_dot": lambda t: 3 * np.sin(2 * np.pi * 20 * t),
     }
     data = made(tmp_path, signals, 5.0)
-    first, second = drawn(waveform(data, ["y1", "y2_dot"], window_s)).axes
+    first, second = drawn(waveform(Look(), data, ["y1", "y2_dot"], window_s)).axes
     assert (first.get_ylabel(), second.get_ylabel()) == ("µm", "mm/s")
     assert second.get_xlim() == pytest.approx((0, shown_ms), abs=0.5)
     assert first.get_title(loc="right").startswith("14 µm p-p     4.95 µm rms     about a mean of 500 µm")
@@ -338,6 +337,6 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
 
 def test_a_waveform_is_interrupted_at_a_gap(tmp_path: Path) -> None:
     data = made(tmp_path, {"y1": lambda t: np.sin(9 * t)}, 3.0, without=[25])
-    axes = drawn(waveform(data, ["y1"], 1.0)).axes[0]
+    axes = drawn(waveform(Look(), data, ["y1"], 1.0)).axes[0]
     starts = [float(np.asarray(line.get_xdata())[0]) for line in axes.lines[0:4:2]]
     assert starts == pytest.approx([0, 600])

@@ -178,8 +178,8 @@ def test_plots_of_the_history_go_on_when_a_sensor_dies() -> None:
     bearing, disc = centre.places
     assert bearing.z_um[-1] is None
     assert None not in disc.y_um
-    for draw in (polar(history, ["y1", "z1"], 1, 8, None), centreline(history, None, 1.0, None)):
-        draw(Look()).canvas.draw()
+    for figure in (polar(Look(), history, ["y1", "z1"], 1, 8, None), centreline(Look(), history, None, 1.0, None)):
+        figure.canvas.draw()
 
 
 @pytest.mark.parametrize("way", ["live", "recorded"])
