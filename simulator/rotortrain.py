@@ -100,10 +100,7 @@ def commission(
     healthy: Annotated[
         list[Path],
         typer.Option(
-            "--healthy",
-            exists=True,
-            dir_okay=False,
-            help="Recording of the healthy machine; may be repeated, or followed by more.",
+            exists=True, dir_okay=False, help="Recording of the healthy machine; may be repeated, or followed by more."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", file_okay=False, help="Directory of the bundle and the report.")],

@@ -151,10 +151,10 @@ def revoke(
 @commands.command()
 def audit(
     machine: Annotated[
-        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Only what was done to this machine.")
+        str | None, typer.Option(metavar="SITE/MACHINE", help="Only what was done to this machine.")
     ] = None,
-    actor: Annotated[str | None, typer.Option("--actor", metavar="NAME", help="Only what this user did.")] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, max=100_000, help="At most this many, the newest.")] = 50,
+    actor: Annotated[str | None, typer.Option(metavar="NAME", help="Only what this user did.")] = None,
+    limit: Annotated[int, typer.Option(min=1, max=100_000, help="At most this many, the newest.")] = 50,
     config: HistoryOption = None,
 ) -> None:
     """Show who did what over HTTP, and who was refused; newest first, times in UTC.

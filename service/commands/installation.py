@@ -26,36 +26,31 @@ _EXAMPLE = "DE-H acceleration g DE horizontal"
 @commands.command()
 def init(
     folder: Annotated[
-        Path, typer.Option("--folder", metavar="DIR", help="Folder for the two files; created if it does not exist.")
+        Path, typer.Option(metavar="DIR", help="Folder for the two files; created if it does not exist.")
     ] = Path(),
-    site: Annotated[str | None, typer.Option("--site", help="Site of the machine: a group of machines.")] = None,
-    name: Annotated[str | None, typer.Option("--name", help="Name of the machine.")] = None,
-    rate_hz: Annotated[
-        float | None, typer.Option("--rate-hz", metavar="HZ", help="Samples per second and channel.")
-    ] = None,
+    site: Annotated[str | None, typer.Option(help="Site of the machine: a group of machines.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the machine.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Samples per second and channel.")] = None,
     sensor: Annotated[
         list[str] | None,
         typer.Option(
-            "--sensor",
             metavar="'NAME QUANTITY UNIT LOCATION DIRECTION [ANGLE]'",
             help=f"A channel of the stream, in stream order, such as '{_EXAMPLE}'; for a probe at an angle "
             "add it, in degrees from +y towards +z: 'VE-1X displacement um bearing X 45'. Repeatable.",
         ),
     ] = None,
     speed_rpm: Annotated[
-        float | None, typer.Option("--speed-rpm", metavar="RPM", help="Nominal speed, if it is known: for 1x and 2x.")
+        float | None, typer.Option(metavar="RPM", help="Nominal speed, if it is known: for 1x and 2x.")
     ] = None,
     snapshots: Annotated[
         str | None,
         typer.Option(
-            "--snapshots",
             metavar="'SECONDS EVERY'",
             help="If samples come in snapshots, their length and period in seconds, such as '0.1 10'.",
         ),
     ] = None,
     zones: Annotated[
-        list[str] | None,
-        typer.Option("--zones", help="Zones of a standard, such as 'ISO 20816-3 group 2 rigid'. Repeatable."),
+        list[str] | None, typer.Option(help="Zones of a standard, such as 'ISO 20816-3 group 2 rigid'. Repeatable.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
@@ -170,14 +165,13 @@ def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
 
 @commands.command()
 def doctor(
-    machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file: shipped name or path.")],
+    machine: Annotated[str, typer.Option(metavar="FILE", help="Machine file: shipped name or path.")],
     connect: ConnectOption = None,
     listen: ListenOption = None,
     link: LinkOption = None,
     seconds: Annotated[
         float | None,
         typer.Option(
-            "--seconds",
             min=1,
             max=86400,
             callback=finite,

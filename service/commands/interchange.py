@@ -22,11 +22,9 @@ def import_(
             help="CSV, Parquet, NumPy .npz, MATLAB .mat, HDF5, WAV, UFF 58, TDMS or MF4 file, or a folder of them.",
         ),
     ],
-    mapping: Annotated[
-        Path, typer.Option("--mapping", metavar="FILE", help="Mapping of columns to channels and units (TOML).")
-    ],
-    machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file, or name of a shipped one.")],
-    out: Annotated[Path, typer.Option("--out", metavar="RECORDING", help="Recording to write (.mcap).")],
+    mapping: Annotated[Path, typer.Option(metavar="FILE", help="Mapping of columns to channels and units (TOML).")],
+    machine: Annotated[str, typer.Option(metavar="FILE", help="Machine file, or name of a shipped one.")],
+    out: Annotated[Path, typer.Option(metavar="RECORDING", help="Recording to write (.mcap).")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
 ) -> None:
     """Turn measurements from another program into a recording.
@@ -65,18 +63,16 @@ def export(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (.mcap); several are joined in time.")
     ],
-    to: Annotated[Literal["parquet", "csv", "mat"], typer.Option("--to", help="Format.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write.")],
+    to: Annotated[Literal["parquet", "csv", "mat"], typer.Option(help="Format.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
     what: Annotated[
-        Literal["stream", "reports", "alarms"], typer.Option("--what", help="Samples, reports or alarm events.")
+        Literal["stream", "reports", "alarms"], typer.Option(help="Samples, reports or alarm events.")
     ] = "stream",
     machine: Annotated[
-        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Machine to export, if there are several.")
+        str | None, typer.Option(metavar="SITE/MACHINE", help="Machine to export, if there are several.")
     ] = None,
     from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC).")] = None,
-    to_time: Annotated[
-        str | None, typer.Option("--to-time", metavar="TIME", help="Data up to this time (UTC).")
-    ] = None,
+    to_time: Annotated[str | None, typer.Option(metavar="TIME", help="Data up to this time (UTC).")] = None,
     si: Annotated[bool, typer.Option("--si", help="Samples in SI units instead of those of the channels.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:

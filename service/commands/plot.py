@@ -189,7 +189,6 @@ def trend(
     machine: Annotated[
         str | None,
         typer.Option(
-            "--machine",
             metavar="FILE[@BUNDLE]",
             help="Evaluate again with this machine file, and after @ its bundle. If left out, the recorded reports are "
             "shown; without any, those of the shipped machine with the recorded site and name.",
@@ -212,7 +211,6 @@ def correlation(
     machine: Annotated[
         str | None,
         typer.Option(
-            "--machine",
             metavar="FILE[@BUNDLE]",
             help="Machine file, and after @ the bundle with the networks. If left out, the shipped machine with the "
             "recorded site and name.",
@@ -229,7 +227,7 @@ def correlation(
 def orbit(
     picture: _Picture,
     at: _AtOption = None,
-    revolutions: Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many.")] = 8,
+    revolutions: Annotated[int, typer.Option(min=1, max=1000, help="How many.")] = 8,
 ) -> "Figure":
     """The shaft's path at bearing and disc, as measured and at running speed alone."""
     from service.analysis.figures.samples import orbit as read  # noqa: PLC0415
@@ -246,7 +244,7 @@ def spectrum(
     resolution: _ResolutionOption = 0.5,
     density: _DensityOption = False,
     scale: Annotated[
-        Literal["log", "linear"] | None, typer.Option("--scale", help="Linear for amplitudes, log for densities.")
+        Literal["log", "linear"] | None, typer.Option(help="Linear for amplitudes, log for densities.")
     ] = None,
     to_hz: _ToHzOption = None,
 ) -> "Figure":
@@ -262,19 +260,17 @@ def waterfall(
     picture: _Picture,
     channel: Annotated[
         list[str] | None,
-        typer.Option(
-            "--channel", metavar="NAME", help="If left out, the first displacement, velocity or acceleration."
-        ),
+        typer.Option(metavar="NAME", help="If left out, the first displacement, velocity or acceleration."),
     ] = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per spectrum.")] = 4.0,
+    window: Annotated[float, typer.Option(metavar="S", help="Seconds of data per spectrum.")] = 4.0,
     resolution: _ResolutionOption = 0.5,
     density: _DensityOption = False,
     scale: Annotated[
         Literal["log", "linear"] | None,
-        typer.Option("--scale", help="Scale of colours or heights; if left out, log for colours and densities."),
+        typer.Option(help="Scale of colours or heights; if left out, log for colours and densities."),
     ] = None,
     to_hz: _ToHzOption = None,
-    axis: Annotated[Literal["time", "speed"], typer.Option("--axis", help="Over time, or over the speed.")] = "time",
+    axis: Annotated[Literal["time", "speed"], typer.Option(help="Over time, or over the speed.")] = "time",
     cascade: Annotated[bool, typer.Option("--cascade", help="Lines instead of colours.")] = False,
 ) -> "Figure":
     """Spectra of one channel over time, or over speed in a run-up."""
@@ -291,7 +287,7 @@ def waveform(
     at: _AtOption = None,
     channel: _ChannelsOption = None,
     window: Annotated[
-        float | None, typer.Option("--window", metavar="S", help="Seconds shown; as long as 8 revolutions if left out.")
+        float | None, typer.Option(metavar="S", help="Seconds shown; as long as 8 revolutions if left out.")
     ] = None,
 ) -> "Figure":
     """Samples of channels over time, with the keyphasor's pulses."""
@@ -308,11 +304,9 @@ def full_spectrum(
     place: _PlaceOption = None,
     window: _WindowOption = 20.0,
     resolution: _ResolutionOption = 0.5,
-    scale: Annotated[Literal["log", "linear"], typer.Option("--scale", help="Scale of amplitudes.")] = "linear",
+    scale: Annotated[Literal["log", "linear"], typer.Option(help="Scale of amplitudes.")] = "linear",
     to_hz: _ToHzOption = None,
-    axis: Annotated[
-        Literal["hz", "orders"], typer.Option("--axis", help="Frequencies, or multiples of running speed.")
-    ] = "hz",
+    axis: Annotated[Literal["hz", "orders"], typer.Option(help="Frequencies, or multiples of running speed.")] = "hz",
 ) -> "Figure":
     """Forward and reverse precession of the shaft at a place, from its displacements in y and z."""
     from service.analysis.figures.spectrum import full_spectrum as read  # noqa: PLC0415
@@ -325,10 +319,9 @@ def full_spectrum(
 def centreline(
     picture: _Picture,
     place: _PlaceOption = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data per mean.")] = 1.0,
+    window: Annotated[float, typer.Option(metavar="S", help="Seconds of data per mean.")] = 1.0,
     clearance: Annotated[
-        float | None,
-        typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, start at the bottom."),
+        float | None, typer.Option(metavar="UM", help="Diametral clearance, µm: its circle, start at the bottom.")
     ] = None,
 ) -> "Figure":
     """Mean position of the shaft across the bearing, from gaps in y and z, over speed or time."""
@@ -348,9 +341,7 @@ def bode(
     slow_roll: _SlowRollOption = None,
     speeds: Annotated[
         str | None,
-        typer.Option(
-            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: range to search for the speed. Gives no phase."
-        ),
+        typer.Option(metavar="RPM-RPM", help="Without a keyphasor: range to search for the speed. Gives no phase."),
     ] = None,
 ) -> "Figure":
     """Amplitude and phase lag of 1x over the speed, from a run-up or coast-down."""

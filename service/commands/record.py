@@ -29,30 +29,26 @@ commands = typer.Typer()
 @commands.command()
 def record(
     machine: Annotated[
-        list[str] | None,
-        typer.Option("--machine", metavar="FILE", help="Machine to record: shipped name or path. Repeatable."),
+        list[str] | None, typer.Option(metavar="FILE", help="Machine to record: shipped name or path. Repeatable.")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder of the files, which are in DIR/<site>/<machine>/."),
+        Path | None, typer.Option(metavar="DIR", help="Folder of the files, which are in DIR/<site>/<machine>/.")
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
-            "--config", metavar="FILE", help="Settings (TOML) of the monitor: machines, \\[recording], \\[history]."
-        ),
+        typer.Option(metavar="FILE", help="Settings (TOML) of the monitor: machines, \\[recording], \\[history]."),
     ] = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
     link: LinkOption = None,
     rotate_s: Annotated[
-        float | None, typer.Option("--rotate-s", metavar="SECONDS", help="Longest time in one file; 300 if left out.")
+        float | None, typer.Option(metavar="SECONDS", help="Longest time in one file; 300 if left out.")
     ] = None,
     rotate_mb: Annotated[
-        float | None, typer.Option("--rotate-mb", metavar="MB", help="Size at which a file is closed; 256 if left out.")
+        float | None, typer.Option(metavar="MB", help="Size at which a file is closed; 256 if left out.")
     ] = None,
     keep_gb: Annotated[
-        float | None, typer.Option("--keep-gb", metavar="GB", help="Most that is kept per machine; 20 if left out.")
+        float | None, typer.Option(metavar="GB", help="Most that is kept per machine; 20 if left out.")
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="The recorders' status as JSON lines: how many messages are safe on disk.")
@@ -119,7 +115,6 @@ def recover(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
             metavar="FILE",
             help="Name of the recovered recording, for one FILE. If left out: NAME.mcap, or NAME.recovered.mcap if the "
             "damaged file has that name.",

@@ -56,7 +56,6 @@ def replay(
     machine: Annotated[
         str | None,
         typer.Option(
-            "--machine",
             metavar="FILE[@BUNDLE]",
             help="Offline: evaluate with this machine file, and after @ its bundle (trained or commissioned). If left "
             "out, the shipped machine with the recorded site and name, with its networks.",
@@ -71,25 +70,22 @@ def replay(
         ),
     ] = None,
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="FILE", help="Offline: settings (TOML) that name machine files and bundles."),
+        Path | None, typer.Option(metavar="FILE", help="Offline: settings (TOML) that name machine files and bundles.")
     ] = None,
     ray: Annotated[
         str | None,
         typer.Option(
-            "--ray",
             metavar="ADDRESS",
             help="Offline: every recorded machine, each a task on this Ray cluster (auto: that of this "
             "computer); --out is then a folder, with one file for each.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Offline: write the lines here, not to the terminal.")
+        Path | None, typer.Option(metavar="FILE", help="Offline: write the lines here, not to the terminal.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Offline: replace the file of --out.")] = False,
     key: Annotated[
-        str | None,
-        typer.Option("--key", metavar="SITE/MACHINE", help="Only this machine, if the recordings contain several."),
+        str | None, typer.Option(metavar="SITE/MACHINE", help="Only this machine, if the recordings contain several.")
     ] = None,
     from_: FromOption = None,
     to: ToOption = None,
@@ -103,20 +99,19 @@ def replay(
         ),
     ] = None,
     pace: Annotated[
-        str, typer.Option("--pace", help="Seconds of data per second, 0.1 to 1000, or max: as fast as accepted.")
+        str, typer.Option(help="Seconds of data per second, 0.1 to 1000, or max: as fast as accepted.")
     ] = "1",
     loop: Annotated[
-        str, typer.Option("--loop", metavar="N", help="Passes, or forever; each has its own prefix: PREFIX/1, ...")
+        str, typer.Option(metavar="N", help="Passes, or forever; each has its own prefix: PREFIX/1, ...")
     ] = "1",
     everything: Annotated[
         bool, typer.Option("--all", help="Every recorded key, not only stream, descriptor and truth.")
     ] = False,
     connect: Annotated[
-        list[str] | None,
-        typer.Option("--connect", metavar="ENDPOINT", help=f"Zenoh endpoint; {ENDPOINT} if left out. Repeatable."),
+        list[str] | None, typer.Option(metavar="ENDPOINT", help=f"Zenoh endpoint; {ENDPOINT} if left out. Repeatable.")
     ] = None,
     listen: Annotated[
-        list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here instead. Repeatable.")
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Listen here instead. Repeatable.")
     ] = None,
     wait_s: Annotated[
         float,
@@ -130,10 +125,10 @@ def replay(
     ] = 0.0,
     progress: Annotated[
         Literal["auto", "json", "none"],
-        typer.Option("--progress", help="A bar if there is a terminal; or JSON lines on standard output; or nothing."),
+        typer.Option(help="A bar if there is a terminal; or JSON lines on standard output; or nothing."),
     ] = "auto",
     control: Annotated[bool, typer.Option("--control", hidden=True, help="Take commands from standard input.")] = False,
-    nice: Annotated[int, typer.Option("--nice", min=0, max=19, hidden=True, help="Run at lower priority.")] = 0,
+    nice: Annotated[int, typer.Option(min=0, max=19, hidden=True, help="Run at lower priority.")] = 0,
 ) -> None:
     """Replay recordings: offline through the monitor, or onto the network byte for byte.
 

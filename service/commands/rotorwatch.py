@@ -48,12 +48,11 @@ def _program(_version: VersionOption = False) -> None:
 @app.command()
 def run(
     config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML); the shipped machine if left out.")
+        Path | None, typer.Option(metavar="FILE", help="Settings (TOML); the shipped machine if left out.")
     ] = None,
     machine: Annotated[
         list[str] | None,
         typer.Option(
-            "--machine",
             metavar="FILE[@BUNDLE]",
             help="Monitor this machine instead of those in the settings: shipped name or path, and after @ its bundle "
             "(trained or commissioned), if any. Repeatable.",
@@ -63,14 +62,13 @@ def run(
     connect: ConnectOption = None,
     link: LinkOption = None,
     http_port: Annotated[
-        int | None, typer.Option("--http-port", min=0, max=65535, help="Port of the HTTP API; 0 takes a free one.")
+        int | None, typer.Option(min=0, max=65535, help="Port of the HTTP API; 0 takes a free one.")
     ] = None,
     when_full: Annotated[
         Literal["drop", "wait"] | None,
         typer.Option(
-            "--when-full",
             help="When blocks come faster than they can be evaluated: drop and count them (live machines), or make the "
-            "sender wait (batch runs).",
+            "sender wait (batch runs)."
         ),
     ] = None,
     namespace: NamespaceOption = None,
@@ -115,9 +113,7 @@ def run(
 
 @app.command()
 def fleet(
-    config: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Settings (TOML), the same files on every computer.")
-    ],
+    config: Annotated[Path, typer.Option(metavar="FILE", help="Settings (TOML), the same files on every computer.")],
     address: Annotated[
         str,
         typer.Option("--address", metavar="ADDRESS", help="Ray cluster: auto is that of this computer, or HOST:PORT."),
@@ -253,7 +249,7 @@ def secret() -> None:
 @webhooks.command("test")
 def test_webhook(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the webhook in the settings.")],
-    config: Annotated[Path, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor.")],
+    config: Annotated[Path, typer.Option(metavar="FILE", help="Settings (TOML) of the monitor.")],
 ) -> None:
     """Send a test event, which is not an alarm, and report whether the receiver accepts it; exit code 1 if not.
 
@@ -277,12 +273,10 @@ def test_webhook(
 def demo(
     fault: Annotated[
         Literal["k_by", "c_by", "k_bz", "c_bz", "e", "none"],
-        typer.Option("--fault", help="What breaks first; with none, the machine stays healthy."),
+        typer.Option(help="What breaks first; with none, the machine stays healthy."),
     ] = "k_by",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all random forces and noise.")] = 1,
-    pace: Annotated[
-        float, typer.Option("--pace", min=0.1, max=100, callback=finite, help="Data seconds per second.")
-    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random forces and noise.")] = 1,
+    pace: Annotated[float, typer.Option(min=0.1, max=100, callback=finite, help="Data seconds per second.")] = 10.0,
     once: Annotated[
         bool,
         typer.Option("--once", help="End after the first fault; exit 0 only if exactly the injected fault was named."),
@@ -290,7 +284,6 @@ def demo(
     http_port: Annotated[
         int | None,
         typer.Option(
-            "--http-port",
             min=0,
             max=65535,
             help="Port of the HTTP API. If left out 8080, and 7447 for Zenoh, where they are free; 0 takes free ones.",

@@ -19,36 +19,29 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 @commands.command()
 def size(
-    machines: Annotated[int, typer.Option("--machines", min=1, max=1_000_000, help="Number of machines.")],
-    channels: Annotated[
-        int, typer.Option("--channels", min=1, max=1000, help="Per machine, shaft angle included.")
-    ] = 9,
+    machines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of machines.")],
+    channels: Annotated[int, typer.Option(min=1, max=1000, help="Per machine, shaft angle included.")] = 9,
     rate: Annotated[
-        float, typer.Option("--rate", metavar="HZ", min=1.0, max=1e6, help="Samples per second and channel.")
+        float, typer.Option(metavar="HZ", min=1.0, max=1e6, help="Samples per second and channel.")
     ] = 2000.0,
-    hop: Annotated[float, typer.Option("--hop", metavar="S", min=0.1, help="Seconds between reports.")] = 5.0,
+    hop: Annotated[float, typer.Option(metavar="S", min=0.1, help="Seconds between reports.")] = 5.0,
     levels_only: Annotated[
         bool, typer.Option("--levels-only", help="Only watch vibration levels; diagnose nothing.")
     ] = False,
     networks: Annotated[bool, typer.Option(help="Trained networks in addition to the likelihood.")] = True,
-    cores: Annotated[int, typer.Option("--cores", min=1, max=1024, help="Per computer.")] = 8,
+    cores: Annotated[int, typer.Option(min=1, max=1024, help="Per computer.")] = 8,
     busy: Annotated[
-        float,
-        typer.Option(
-            "--busy", min=0.05, max=1.0, callback=finite, help="Part of the cores that may be used on average."
-        ),
+        float, typer.Option(min=0.05, max=1.0, callback=finite, help="Part of the cores that may be used on average.")
     ] = 0.6,
-    reports_days: Annotated[
-        float | None, typer.Option("--reports-days", metavar="DAYS", help="How long reports are kept.")
-    ] = None,
+    reports_days: Annotated[float | None, typer.Option(metavar="DAYS", help="How long reports are kept.")] = None,
     readings_days: Annotated[
-        float | None, typer.Option("--readings-days", metavar="DAYS", help="How long single readings are kept.")
+        float | None, typer.Option(metavar="DAYS", help="How long single readings are kept.")
     ] = None,
     keep_days: Annotated[
-        float | None, typer.Option("--keep-days", metavar="DAYS", help="How long recordings without an alarm are kept.")
+        float | None, typer.Option(metavar="DAYS", help="How long recordings without an alarm are kept.")
     ] = None,
     keep_gb: Annotated[
-        float | None, typer.Option("--keep-gb", metavar="GB", help="Most kept of these recordings per machine.")
+        float | None, typer.Option(metavar="GB", help="Most kept of these recordings per machine.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The figures of all machines, for another program.")] = False,
 ) -> None:

@@ -38,9 +38,7 @@ _STYLES = {
 
 @commands.command()
 def watch(
-    machine: Annotated[
-        str, typer.Option("--machine", metavar="SITE/MACHINE", help="Machine to show; * stands for any.")
-    ] = "*/*",
+    machine: Annotated[str, typer.Option(metavar="SITE/MACHINE", help="Machine to show; * stands for any.")] = "*/*",
     connect: ConnectOption = None,
     link: LinkOption = None,
     windows: Annotated[bool, typer.Option("--windows", help="Also one line per evaluated window.")] = False,
@@ -95,22 +93,18 @@ def watch(
 
 @commands.command()
 def status(
-    url: Annotated[str, typer.Option("--url", help="Address of the monitor's HTTP API.")] = "http://127.0.0.1:8080",
+    url: Annotated[str, typer.Option(help="Address of the monitor's HTTP API.")] = "http://127.0.0.1:8080",
     token: Annotated[
         str | None,
         typer.Option(
-            "--token",
             envvar="ROTORWATCH_TOKEN",
             show_envvar=True,
             help="Token with the scope read, if the API requires one; preferably set in the environment.",
         ),
     ] = None,
-    ca: Annotated[
-        Path | None, typer.Option("--ca", metavar="FILE", help="Authority (PEM) of the API's certificate.")
-    ] = None,
+    ca: Annotated[Path | None, typer.Option(metavar="FILE", help="Authority (PEM) of the API's certificate.")] = None,
     certificate: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option("--certificate", metavar="FILE KEY", help="Own certificate and key (PEM), if required."),
+        tuple[Path, Path] | None, typer.Option(metavar="FILE KEY", help="Own certificate and key (PEM), if required.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document, for another program.")] = False,
 ) -> None:
