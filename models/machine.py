@@ -20,7 +20,7 @@ from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
 from models.mistakes import changed, checked, did_you_mean, read_toml
-from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
+from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters, natural_frequencies
 from models.signals.channels import Channel, ChannelDescriptor, Quantity, state_name
 from models.signals.keys import MachineKeys
 from models.signals.sensor import Sensor
@@ -210,6 +210,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         if not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
             return fields
         modes_hz: tuple[float, ...] = ()
+        decays: tuple[tuple[float, float], ...] = ()
         schedule, speed_hz = None, None
         with suppress(KeyError, ValidationError):  # reported when the table itself is checked
             schedule = Schedule.model_validate(fields["schedule"])
@@ -217,9 +218,13 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             speed_hz = Operation.model_validate(fields["operation"]).speed_rpm / 60
         with suppress(KeyError, ValidationError):
             modes_hz = KnownRotor.model_validate(fields["rotor"], from_attributes=True).modes_hz
+            if modes_hz and speed_hz:
+                rotor = RotorParameters.model_validate(fields["rotor"], from_attributes=True)
+                hz, damping = natural_frequencies(rotor, 2 * math.pi * speed_hz)
+                decays = tuple(zip(hz.tolist(), (2 * math.pi * hz * damping).tolist(), strict=True))
         if schedule is not None and isinstance(fields.get("ingest", {}), dict):
             fields = fields | {"ingest": schedule.ingest() | fields.get("ingest", {})}
-        window = default_window(rate_hz, given, schedule, modes_hz, speed_hz) | given
+        window = default_window(rate_hz, given, schedule, modes_hz, speed_hz, decays) | given
         return fields | {"window": window} if window else fields
 
     @model_validator(mode="after")

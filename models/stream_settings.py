@@ -2,7 +2,8 @@
 
 The usual window, lags and band suit machines whose motion lies between some 6 and 120 Hz. For a faster or slower one
 all times are multiplied by one factor, unless it is near one: the factor follows from the natural frequencies, or from
-the speed if these are not known.
+the speed if these are not known. The usual segments suit modes that are not narrower than what a segment resolves:
+for narrower ones they are longer.
 """
 
 import math
@@ -16,9 +17,13 @@ _USABLE = 0.4
 _SLOW_HZ, _FAST_HZ = 6.0, 120.0
 """Least first and largest fourth natural frequency (lateral, of bearing and disc) that the usual window suits, Hz."""
 _FAST_SPEED_HZ = 50.0
-_SLOWEST = 59.0  # segments of two minutes are the longest
+_SLOWEST, _LONGEST_SEGMENT_S = 59.0, 120.0
 NEAR = 0.8
 """Time scale, or its reciprocal, from which on the usual window is near enough."""
+_SEGMENTS_S = (2.0, 5.0, 10.0)  # usual one, and longer ones that fit the usual hop
+_RESOLVED = 1.5 * math.pi
+"""Decay of a mode over a segment, in nepers, from which its half-power bandwidth is at least the noise bandwidth of a
+Hann window (1.5 bins: F. J. Harris, Proc. IEEE 66 (1978), table 1)."""
 _LENGTHS = ("segment_s", "hop_s", "length_s", "max_span_s")
 
 
@@ -64,7 +69,9 @@ class WindowSettings(BaseModel, extra="forbid", frozen=True):
     lag_from_s: float = Field(default=0.01, ge=0, le=10, description="shortest lag of the relation networks")
     lag_to_s: float = Field(default=0.125, gt=0, le=10, description="longest lag of the correlation functions")
     lag_step_s: float = Field(default=0.001, gt=0, le=1, description="lag spacing of the relation networks")
-    segment_s: float = Field(default=2.0, gt=0, le=120, description="segment of the cross-spectra, half overlapped")
+    segment_s: float = Field(
+        default=2.0, gt=0, le=_LONGEST_SEGMENT_S, description="segment of the cross-spectra, half overlapped"
+    )
     band_hz: tuple[float, float] = Field(default=(3.0, 150.0), description="band of the likelihood, from and to")
 
     @model_validator(mode="after")
@@ -162,7 +169,12 @@ def time_scale(modes_hz: Sequence[float], speed_hz: float | None) -> float:
 
 
 def default_window(
-    rate_hz: float, given: Collection[str], schedule: Schedule | None, modes_hz: Sequence[float], speed_hz: float | None
+    rate_hz: float,
+    given: Collection[str],
+    schedule: Schedule | None,
+    modes_hz: Sequence[float],
+    speed_hz: float | None,
+    decays: Sequence[tuple[float, float]] = (),
 ) -> dict[str, object]:
     """Settings of the window that are not given and are not the usual ones.
 
@@ -170,12 +182,16 @@ def default_window(
     nearest settings that are whole numbers of samples are taken, and the band ends within what the rate allows. Fast
     and slow machines have their own, see `time_scale`; a slow one has the usual ones if one of the lengths is given,
     because the others have to fit it. Segments of a fast machine are not shortened: the same time gives more
-    information about it, so the leakage from one frequency into the next has to be smaller too.
+    information about it, so the leakage from one frequency into the next has to be smaller too. They are longer where a
+    mode in the band is narrower than they resolve; `decays` are frequency (Hz) and decay rate (1/s) of each mode, where
+    damping is known.
 
     Examples
     --------
     >>> default_window(200.0, (), None, (), None)
     {'band_hz': (3.0, 80.0), 'lag_step_s': 0.005}
+    >>> default_window(2000.0, (), None, (), None, [(12.0, 0.6)])["segment_s"]
+    10.0
     >>> round(default_window(51200 / 3, (), None, (), None)["hop_s"] * 51200 / 3, 6)
     85335.0
     >>> default_window(20000.0, (), None, (), 330.0)["band_hz"]
@@ -195,6 +211,9 @@ def default_window(
     found: dict[str, object] = {} if (low_hz, high_hz) == usual.band_hz else {"band_hz": (low_hz, high_hz)}
     step_s, longer = usual.lag_step_s * scale, max(scale, 1.0)
     lengths = {name: getattr(usual, name) * longer for name in _LENGTHS}
+    slowest = min((decay for hz, decay in decays if hz < high_hz), default=math.inf)
+    segments_s = [longer * one for one in _SEGMENTS_S if longer * one <= _LONGEST_SEGMENT_S]
+    lengths["segment_s"] = next((one for one in segments_s if one * slowest >= _RESOLVED), segments_s[-1])
     if scale != 1 and not {"lag_from_s", "lag_to_s"} & {*given}:
         found |= {name: getattr(usual, name) * scale for name in ("lag_from_s", "lag_to_s")}
     if scale != 1 or not whole(step_s * rate_hz):
@@ -203,7 +222,7 @@ def default_window(
         found |= schedule.window(rate_hz, usual.model_copy(update={"segment_s": lengths["segment_s"]} | found))
     elif {"segment_s", "hop_s", "length_s"} & {*given}:  # multiples of each other
         return found
-    elif longer != 1 or not all(whole(length * rate_hz) for length in lengths.values()):
+    elif lengths["segment_s"] != usual.segment_s or not all(whole(each * rate_hz) for each in lengths.values()):
         half = max(1, round(lengths["segment_s"] / 2 * rate_hz))
         found |= {name: round(2 * each / lengths["segment_s"]) * half / rate_hz for name, each in lengths.items()}
     return found

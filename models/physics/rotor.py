@@ -203,6 +203,13 @@ def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     return A
 
 
+def natural_frequencies(rotor: RotorParameters, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
+    """Natural frequencies (Hz) and damping ratios of a turning rotor, of each mode that oscillates."""
+    poles = np.linalg.eigvals(system_A(rotor, speed_rad_s))
+    poles = poles[poles.imag > 0]
+    return np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles)
+
+
 def impossible(change: float, quantity: str) -> str:
     """Why a relative change of a positive quantity (a mass, a gain, a length) is impossible; empty if it is possible.
 

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from models.alarm_names import LEVEL
 from models.checkpoint import checked
 from models.commissioning.commissioned import Installed
-from models.diagnosis.likelihood.motions import natural_frequencies
 from models.diagnosis.window.lines import LatestLines, new_line, steady_lines
 from models.diagnosis.window.moments import HopMoments, Plan
 from models.diagnosis.window.sliding import SlidingWindow
@@ -25,6 +24,7 @@ from models.levels.measures import STANDS_RAD_S, WindowLevels
 from models.levels.orders import ORDERS
 from models.levels.reference import QUIET, FirstWindows, LevelReference, expected_levels
 from models.machine import Machine, MachineFile
+from models.physics.rotor import natural_frequencies
 from models.signals.channels import state_name, with_channel_names
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
@@ -173,7 +173,7 @@ class LevelWatch:
         """Reference from theory, for a machine that has not been commissioned."""
         operation, names = machine.operation, [machine.sensors[column].name for column in self._columns]
         slowest, fastest = (operation.speed_rad_s * (1 + sign * operation.speed_tolerance) for sign in (-1, 1))
-        modes = zip(*(each.tolist() for each in natural_frequencies(machine)), strict=True)
+        modes = zip(*(each.tolist() for each in natural_frequencies(machine.rotor, operation.speed_rad_s)), strict=True)
         return expected_levels(names, levels, (slowest, fastest), tuple(modes))
 
     def rewired(self) -> tuple[SensorFault, ...]:

@@ -2,7 +2,7 @@
 
 **Bins.** The spectrum that Hann-windowed segments estimate is not the spectrum at the bin but its average under the
 window's kernel. On the grid of the segment's own frequencies that kernel is (1, 4, 1)/6, exactly so for a motion that
-decays within a segment; a motion that rings longer needs a grid twice as fine. A theory that is averaged the same way
+decays within a segment; a motion that rings longer needs a finer grid. A theory that is averaged the same way
 has no bias from leakage (P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967), for the estimate; A. M. Sykulski et
 al., Biometrika 106 (2019), for comparing with the expectation). Averaging further over a few neighbouring bins is
 linear too, and saves time where the spectrum is smooth.
@@ -21,6 +21,7 @@ is a rotation: its noise is one again, and it holds everything that the pair say
 window's band (``band_hz`` of the machine file) and valid only there. Nothing is filtered in time.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -30,7 +31,7 @@ import numpy.typing as npt
 from models.diagnosis.window.moments import ComplexArray, divided
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
-from models.physics.rotor import STATE_INDEX, system_A
+from models.physics.rotor import STATE_INDEX, natural_frequencies
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
 
@@ -40,13 +41,10 @@ AVERAGES_PER_BIN = 0.4737
 # Squared correlations of a bin with itself and the next two, within a segment plus twice with a neighbouring segment.
 _SCATTER = AVERAGES_PER_BIN * np.array([1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069])
 _KERNEL = np.array([1.0, 4.0, 1.0]) / 6
-_OFFSETS = np.arange(-2.5, 2.6, 0.5)  # in bins
-_FINE_KERNEL = (
-    np.where(np.abs(_OFFSETS) == 1, 0.5, np.sinc(_OFFSETS) / np.where(np.abs(_OFFSETS) == 1, 1, 1 - _OFFSETS**2)) ** 2
-)
-_FINE_KERNEL = _FINE_KERNEL / _FINE_KERNEL.sum()
-# Decay over a segment, in nepers, of the longest-ringing mode in the band, below which the fine grid is used.
-_RINGING = 8.0
+# Decay over a segment, in nepers, of the longest-ringing mode in the band, below which a finer grid is used; and the
+# least decay over the time 1 / spacing of that grid, whose sum over the mode's line is off by twice exp(-decay).
+_RINGING, _LEAST_DECAY = 8.0, 7.0
+_FINEST = 16  # nodes per bin, at most
 _PER_BANDWIDTH = 0.5  # width of a group over the half-power bandwidth of the nearest mode
 
 
@@ -96,13 +94,6 @@ def _runs(edges: tuple[tuple[int, int], ...]) -> list[tuple[int, int, int]]:
     return runs
 
 
-def natural_frequencies(machine: Machine) -> tuple[FloatArray, FloatArray]:
-    """Natural frequencies (Hz) and damping ratios of the nominal rotor at nominal speed."""
-    poles = np.linalg.eigvals(system_A(machine.rotor, machine.operation.speed_rad_s))
-    poles = poles[poles.imag > 0]
-    return np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles)
-
-
 def group_bins(
     frequencies_hz: FloatArray, machine: Machine, excluded: npt.NDArray[np.bool_], widest_hz: float, speeds: int = 1
 ) -> BinGroups:
@@ -111,7 +102,7 @@ def group_bins(
     Bins that are excluded, shape (n_bins,), belong to no group. The theory is averaged over a number of `speeds`.
     """
     spacing = frequencies_hz[1] - frequencies_hz[0]
-    modes_hz, damping = natural_frequencies(machine)
+    modes_hz, damping = natural_frequencies(machine.rotor, machine.operation.speed_rad_s)
     bandwidth = np.sqrt((damping * modes_hz) ** 2 + ((frequencies_hz[:, None] - modes_hz) / 2) ** 2)
     width_hz = np.minimum(_PER_BANDWIDTH * bandwidth.min(axis=1), widest_hz)
     most = np.maximum(1, np.round(width_hz / spacing)).astype(int)
@@ -126,7 +117,8 @@ def group_bins(
         first = max(end, first + 1)
     in_band = modes_hz < 1.2 * frequencies_hz[-1]
     decay = float(np.min(2 * np.pi * (damping * modes_hz)[in_band], initial=np.inf)) / spacing
-    kernel, finer = (_KERNEL, 1) if decay > _RINGING else (_FINE_KERNEL, 2)
+    finer = 1 if decay > _RINGING else min(_FINEST, 2 ** math.ceil(math.log2(max(2.0, _LEAST_DECAY / decay))))
+    kernel = _KERNEL if finer == 1 else _fine_kernel(finer)
     reach, bins = (kernel.size - 1) // 2, np.array([end - first for first, end in edges], dtype=np.float64)
     n_nodes = finer * (int(bins.max()) - 1) + kernel.size
     nodes_hz, weights = np.empty((len(edges), n_nodes)), np.zeros((len(edges), n_nodes))
@@ -146,6 +138,15 @@ def group_bins(
         shared=_shared_scatter(edges, frequencies_hz.size) / np.sqrt(np.outer(bins, bins)),
         speeds=speeds,
     )
+
+
+@lru_cache
+def _fine_kernel(finer: int) -> FloatArray:
+    """Kernel of a Hann window out to two and a half bins, with `finer` nodes per bin; sums to one."""
+    offsets = np.arange(-5 * finer // 2, 5 * finer // 2 + 1) / finer
+    beside = np.abs(offsets) == 1
+    kernel = np.where(beside, 0.5, np.sinc(offsets) / np.where(beside, 1, 1 - offsets**2)) ** 2
+    return np.asarray(kernel / kernel.sum(), dtype=np.float64)
 
 
 def _shared_scatter(edges: list[tuple[int, int]], n_bins: int) -> FloatArray:
