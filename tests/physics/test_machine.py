@@ -128,6 +128,33 @@ def test_the_default_window_follows_from_the_natural_frequencies(tmp_path: Path)
     assert slow.window.hop_s % (slow.window.segment_s / 2) == pytest.approx(0)
 
 
+@pytest.mark.parametrize(
+    ("c_N_s_per_m", "times", "rate_hz", "more", "segment_s"),
+    [
+        (60.0, 1, 2000.0, (), 2),
+        (6.0, 1, 2000.0, (), 5),
+        (6.0, 1, 51200 / 3, (), 5),
+        (2.0, 1, 2000.0, (), 10),
+        (6.0, 15, 20000.0, (), 2),  # decays fifteen times as fast
+        (2.0, 0.05, 200.0, (), 43),
+        (2.0, 1, 2000.0, ("[window]", "hop_s = 2.0"), 2),
+        (2.0, 1, 2000.0, ("[schedule]", "on_s = 12.0", "every_s = 60.0"), 3),
+    ],
+)
+def test_narrow_modes_have_segments_that_resolve_them(
+    tmp_path: Path, c_N_s_per_m: float, times: float, rate_hz: float, more: tuple[str, ...], segment_s: float
+) -> None:
+    text = in_time(times, rate_hz, *more)
+    for name in ("c_by", "c_bz"):
+        text = text.replace(f"{name}_N_s_per_m = {60.0 * times}", f"{name}_N_s_per_m = {c_N_s_per_m * times}")
+    machine = load_machine(write(tmp_path, text))
+    window = machine.window
+    assert machine.rotor.c_by_N_s_per_m == pytest.approx(c_N_s_per_m * times)
+    assert window.segment_s == pytest.approx(segment_s, rel=1e-4)
+    if machine.schedule is None:
+        assert 2 * window.hop_s / window.segment_s == pytest.approx(round(2 * window.hop_s / window.segment_s))
+
+
 def test_a_given_window_is_used(tmp_path: Path) -> None:
     lengths = ("hop_s = 10.0", "length_s = 120.0", "max_span_s = 200.0", "lag_to_s = 0.05")
     given = kit(tmp_path, 15, 20000.0, "[window]", *lengths)

@@ -18,7 +18,7 @@ from models.diagnosis.window.moments import ComplexArray, plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
+from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed, natural_frequencies
 from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
 from simulator.scenario import Event, Scenario
@@ -44,6 +44,33 @@ def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
     assert held == [k for k, f in enumerate(frequencies_hz) if abs(f - 22) >= 1.6]
     np.testing.assert_allclose(groups.weights.sum(axis=1), 1, rtol=1e-12)
     np.testing.assert_allclose((groups.weights * groups.nodes_hz).sum(axis=1), groups.centre_hz, rtol=1e-12)
+
+
+@pytest.mark.parametrize("damping", [1.0, 0.1, 0.016])
+def test_the_expected_spectrum_of_a_narrow_mode_is_its_average_under_the_kernel(damping: float) -> None:
+    """The mode rings from a sixth of a segment to ten times as long, between two bins or at one."""
+    rotor = LAB.rotor.model_copy(update={name: damping * 60.0 for name in ("c_by_N_s_per_m", "c_bz_N_s_per_m")})
+    machine = LAB.model_copy(update={"rotor": rotor})
+    frequencies_hz = plan_for(machine).frequencies_hz
+    groups = group_bins(frequencies_hz, machine, np.zeros(frequencies_hz.size, dtype=bool), 1.0)
+    modes_hz, ratios = natural_frequencies(rotor, machine.operation.speed_rad_s)
+    first = int(np.argmin(modes_hz))
+    offsets = np.linspace(-2.5, 2.5, 20_001)  # avoids ±1, where the kernel's formula is 0 / 0
+    offsets = offsets[np.abs(np.abs(offsets) - 1) > 1e-9]
+    kernel = (np.sinc(offsets) / (1 - offsets**2)) ** 2
+    for shift in (0.0, 0.5):
+        at_hz = frequencies_hz[np.argmin(np.abs(frequencies_hz - modes_hz[first]))] + shift * 0.2
+
+        def line(f: FloatArray, at_hz: float = at_hz) -> FloatArray:
+            return np.asarray(1 / ((f - at_hz) ** 2 + (ratios[first] * modes_hz[first]) ** 2))
+
+        expected = [
+            np.mean([kernel @ line(f + 0.2 * offsets) for f in frequencies_hz[a:b]]) / kernel.sum()
+            for a, b in groups.edges
+        ]
+        near = np.abs(groups.centre_hz - at_hz) < 0.5
+        found = np.sum(groups.weights * line(groups.nodes_hz), axis=1)
+        np.testing.assert_allclose(found[near], np.array(expected)[near], rtol=0.03)
 
 
 def test_averages_per_bin_match_hann_segments_of_white_noise() -> None:
