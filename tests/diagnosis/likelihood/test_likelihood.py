@@ -48,8 +48,8 @@ def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
 
 @pytest.mark.parametrize("damping", [1.0, 0.1, 0.016])
 def test_the_expected_spectrum_of_a_narrow_mode_is_its_average_under_the_kernel(damping: float) -> None:
-    """The mode rings from a sixth of a segment to ten times as long, between two bins or at one."""
-    rotor = LAB.rotor.model_copy(update={name: damping * 60.0 for name in ("c_by_N_s_per_m", "c_bz_N_s_per_m")})
+    """A mode that decays within a segment and modes that ring on, at a bin and between two bins."""
+    rotor = LAB.rotor.model_copy(update=dict.fromkeys(("c_by_N_s_per_m", "c_bz_N_s_per_m"), damping * 60.0))
     machine = LAB.model_copy(update={"rotor": rotor})
     frequencies_hz = plan_for(machine).frequencies_hz
     groups = group_bins(frequencies_hz, machine, np.zeros(frequencies_hz.size, dtype=bool), 1.0)
