@@ -210,8 +210,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         if not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
             return fields
         modes_hz: tuple[float, ...] = ()
-        decays: tuple[tuple[float, float], ...] = ()
-        schedule, speed_hz = None, None
+        schedule, speed_hz, turning = None, None, None
         with suppress(KeyError, ValidationError):  # reported when the table itself is checked
             schedule = Schedule.model_validate(fields["schedule"])
         with suppress(KeyError, ValidationError):
@@ -220,11 +219,10 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             modes_hz = KnownRotor.model_validate(fields["rotor"], from_attributes=True).modes_hz
             if modes_hz and speed_hz:
                 rotor = RotorParameters.model_validate(fields["rotor"], from_attributes=True)
-                hz, damping = natural_frequencies(rotor, 2 * math.pi * speed_hz)
-                decays = tuple(zip(hz.tolist(), (2 * math.pi * hz * damping).tolist(), strict=True))
+                turning = natural_frequencies(rotor, 2 * math.pi * speed_hz)
         if schedule is not None and isinstance(fields.get("ingest", {}), dict):
             fields = fields | {"ingest": schedule.ingest() | fields.get("ingest", {})}
-        window = default_window(rate_hz, given, schedule, modes_hz, speed_hz, decays) | given
+        window = default_window(rate_hz, given, schedule, modes_hz, speed_hz, turning) | given
         return fields | {"window": window} if window else fields
 
     @model_validator(mode="after")

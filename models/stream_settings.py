@@ -10,7 +10,10 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Self
 
+import numpy as np
 from pydantic import BaseModel, Field, model_validator
+
+from models.signals.block import FloatArray
 
 _USABLE = 0.4
 """Fraction of the sampling rate up to which an anti-aliasing filter passes the signal."""
@@ -168,13 +171,28 @@ def time_scale(modes_hz: Sequence[float], speed_hz: float | None) -> float:
     return 1.0 if NEAR <= scale <= 1 / NEAR else scale
 
 
+def segment_for(modes_hz: FloatArray, damping: FloatArray, to_hz: float, longer: float) -> float:
+    """Length of segments that resolve all modes of a turning rotor below `to_hz`, or the longest that fits, s.
+
+    It is the usual length where that is enough. All are multiplied by `longer`, the time scale of a slow machine.
+
+    Examples
+    --------
+    >>> segment_for(np.array([12.0, 40.0]), np.array([0.01, 0.05]), 150.0, 1.0)
+    10.0
+    """
+    slowest = np.min(2 * np.pi * (modes_hz * damping)[modes_hz < to_hz], initial=np.inf)
+    segments_s = [longer * one for one in _SEGMENTS_S if longer * one <= _LONGEST_SEGMENT_S]
+    return next((one for one in segments_s if one * slowest >= _RESOLVED), segments_s[-1])
+
+
 def default_window(
     rate_hz: float,
     given: Collection[str],
     schedule: Schedule | None,
     modes_hz: Sequence[float],
     speed_hz: float | None,
-    decays: Sequence[tuple[float, float]] = (),
+    turning: tuple[FloatArray, FloatArray] | None = None,
 ) -> dict[str, object]:
     """Settings of the window that are not given and are not the usual ones.
 
@@ -183,15 +201,13 @@ def default_window(
     and slow machines have their own, see `time_scale`; a slow one has the usual ones if one of the lengths is given,
     because the others have to fit it. Segments of a fast machine are not shortened: the same time gives more
     information about it, so the leakage from one frequency into the next has to be smaller too. They are longer where a
-    mode in the band is narrower than they resolve; `decays` are frequency (Hz) and decay rate (1/s) of each mode, where
-    damping is known.
+    mode in the band is narrower than they resolve; `turning` are natural frequencies (Hz) and damping ratios at nominal
+    speed, where they are known.
 
     Examples
     --------
     >>> default_window(200.0, (), None, (), None)
     {'band_hz': (3.0, 80.0), 'lag_step_s': 0.005}
-    >>> default_window(2000.0, (), None, (), None, [(12.0, 0.6)])["segment_s"]
-    10.0
     >>> round(default_window(51200 / 3, (), None, (), None)["hop_s"] * 51200 / 3, 6)
     85335.0
     >>> default_window(20000.0, (), None, (), 330.0)["band_hz"]
@@ -211,9 +227,8 @@ def default_window(
     found: dict[str, object] = {} if (low_hz, high_hz) == usual.band_hz else {"band_hz": (low_hz, high_hz)}
     step_s, longer = usual.lag_step_s * scale, max(scale, 1.0)
     lengths = {name: getattr(usual, name) * longer for name in _LENGTHS}
-    slowest = min((decay for hz, decay in decays if hz < high_hz), default=math.inf)
-    segments_s = [longer * one for one in _SEGMENTS_S if longer * one <= _LONGEST_SEGMENT_S]
-    lengths["segment_s"] = next((one for one in segments_s if one * slowest >= _RESOLVED), segments_s[-1])
+    if turning is not None:
+        lengths["segment_s"] = segment_for(*turning, high_hz, longer)
     if scale != 1 and not {"lag_from_s", "lag_to_s"} & {*given}:
         found |= {name: getattr(usual, name) * scale for name in ("lag_from_s", "lag_to_s")}
     if scale != 1 or not whole(step_s * rate_hz):

@@ -398,6 +398,13 @@ def test_a_longer_recording_lowers_commissioning_errors_and_detectable_changes()
     assert isinstance(much.commissioned, Commissioned)
 
 
+@pytest.mark.parametrize(("segment_s", "noted"), [(0.25, True), (2.0, False)])
+def test_a_note_asks_for_segments_that_resolve_the_narrowest_mode(segment_s: float, noted: bool) -> None:
+    machine = LAB.model_copy(update={"window": LAB.window.model_copy(update={"segment_s": segment_s})})
+    made = commissioned(machine, healthy(machine, 70.0, 41))
+    assert ("Let segment_s in [window] be about 2, and" in "".join(made.report.notes)) is noted
+
+
 @pytest.mark.slow
 def test_a_note_states_the_valid_band_of_the_derivatives() -> None:
     note, linear = made_at("none").report.notes
