@@ -2,9 +2,10 @@
 
 A line has the same strength in every segment, noise does not: for a steady line the mean fourth power of the Fourier
 coefficient is the square of the mean second power, for noise twice that. A line also turns by the same angle from each
-segment to the next, while a resonance loses its phase: the coherence of successive segments is 1 for a line, and c or
-more for n segments of noise with the probability (1 - c²)ⁿ⁻¹. A line too faint to be certain in one window is certain
-if two windows that do not overlap have it: no resonance lasts from one to the other, so the probabilities multiply.
+segment to the next, while a resonance loses its phase: the coherence of segments is 1 for a line, and c or more for n
+segments of noise with the probability (1 - c²)ⁿ⁻¹. A narrow resonance rings through some segments; so the more there
+are, the further apart the compared ones are. A line too faint to be certain in one window is certain if two windows
+that do not overlap have it: no resonance lasts from one to the other, so the probabilities multiply.
 
 Next to a multiple of the speed a line beats with it. In coordinates that turn with the shaft, the multiple stands still
 and the line turns. Without the mean, a single rotation holds nearly all of the rest; with n segments of noise it holds
@@ -33,6 +34,9 @@ _STANDS_OUT, _FAINT = 8.0, 4.0  # power over that of its surroundings, for a lin
 _NEIGHBOURHOOD_HZ = 4.0
 _HARMONICS = 12
 _CHANCE = 1e-9
+# Segments whose phases are compared are an eighth of all apart, at least two, and at most this time: a mode at 10 Hz
+# that is damped by 0.3 % falls to a seventh in it, and the line of a neighbouring machine does not wander too far.
+_PART_APART, _MOST_APART_S = 8, 10.0
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
 _LOUD = 0.02  # part of a channel's random power above which a new line is reported
@@ -80,6 +84,8 @@ def steady_lines(
     speed_hz = abs(window.speed_rad_s) / (2 * np.pi)
     multiples_hz = speed_hz * np.arange(1, _HARMONICS + 1)  # nan, and near none, where the speed is not known
     rotation = np.asarray((np.abs(frequencies_hz[:, None] - multiples_hz) <= (LOBE + 1) * step_hz).any(axis=1))
+    every_s = plan.segment // 2 / plan.rate_hz
+    apart = max(2, min(segments.shape[0] // _PART_APART, round(_MOST_APART_S * max(1.0, plan.time_scale) / every_s)))
     found: dict[int, Line] = {}
     for at, column in np.argwhere((mean > _FAINT * floor) & ~rotation[:, None]):
         lobe = slice(max(0, at - LOBE), at + LOBE + 1)
@@ -87,7 +93,7 @@ def steady_lines(
             continue
         spread = float((power[:, at, column] ** 2).mean() / mean[at, column] ** 2)
         clear = mean[at, column] > _STANDS_OUT * floor[at, column] and spread < _MOST_SPREAD
-        chance = _chance(segments[:, at, column])
+        chance = _chance(segments[:, at, column], apart)
         likely = spread < _MOST_FAINT_SPREAD and chance < math.sqrt(_CHANCE)
         if clear or likely:
             share = min(1.0, float(2 * step_hz * mean[lobe, column].sum() / total[column]))
@@ -95,12 +101,12 @@ def steady_lines(
             line = Line(states[column], float(frequencies_hz[at]), share, certain, likely=likely)
             # A channel in which the line is certain goes before one in which it is louder.
             found[at] = max(found.get(at, line), line, key=lambda one: (one.certain, one.likely, one.share))
-    lines = [*found.values(), *_beside_multiples(plan, window, every, mean, total)]
+    lines = [*found.values(), *_beside_multiples(plan, window, every, mean, total, apart)]
     return tuple(sorted(lines, key=lambda line: -line.share))
 
 
 def _beside_multiples(
-    plan: Plan, window: WindowStatistics, every: ComplexArray, mean: FloatArray, total: FloatArray
+    plan: Plan, window: WindowStatistics, every: ComplexArray, mean: FloatArray, total: FloatArray, apart: int
 ) -> Iterator[Line]:
     """The strongest certain line beside each multiple of the speed, if the speed is steady.
 
@@ -130,7 +136,7 @@ def _beside_multiples(
         column = int(shares.argmax())
         at, multiple_hz = int(own[:, column].argmax()), order * speed_hz
         every_s = plan.segment // 2 / plan.rate_hz
-        offset_hz, certain = _turning(left[:, :, column], at, every_s, frequencies_hz[near][at] - multiple_hz)
+        offset_hz, certain = _turning(left[:, :, column], at, every_s, frequencies_hz[near][at] - multiple_hz, apart)
         # Otherwise the multiple may have changed, which is no reason to refuse a recording and hides no line.
         if certain:
             yield Line(states[column], multiple_hz + offset_hz, min(1.0, float(shares[column])), certain, order)
@@ -183,15 +189,15 @@ def _is_known(line: Line, known: Sequence[KnownLine], speed_rad_s: float) -> boo
     return any(abs(now - then) <= LINE_TOLERANCE * then for one in known for now, then in zip(own, one, strict=True))
 
 
-def _chance(own: ComplexArray) -> float:
+def _chance(own: ComplexArray, apart: int) -> float:
     """Probability that noise keeps its phase as these segments do; they overlap, so every second one is evidence."""
-    earlier, later = own[:-2], own[2:]
+    earlier, later = own[:-apart], own[apart:]
     norms = np.linalg.norm(earlier) * np.linalg.norm(later)
     coherence = min(1.0, float(abs(np.vdot(earlier, later)) / norms))
     return float((1 - coherence**2) ** (earlier.size / 2 - 1))
 
 
-def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tuple[float, bool]:
+def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float, apart: int) -> tuple[float, bool]:
     """Frequency at which most of a bin turns, the alias nearest to `near_hz`; and whether only a line does that."""
     n_segments = left.shape[0]
     size = 16 * n_segments
@@ -206,4 +212,4 @@ def _turning(left: ComplexArray, at: int, every_s: float, near_hz: float) -> tup
     there, back = rotations[[most, -most]].sum(axis=1)
     one_way &= bool(back < _OTHER_WAY * there) and min(most, size - most) * n_segments >= _TURNS * size
     # A resonance that rings from one segment to the next turns one way for a while.
-    return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _chance(own) < _CHANCE
+    return found_hz + round((near_hz - found_hz) * every_s) / every_s, one_way and _chance(own, apart) < _CHANCE

@@ -136,6 +136,18 @@ def test_one_impact_or_burst_in_each_window_is_no_line(damping: float) -> None:
         assert check_lines(machine, [made]).verdict == "passed"
 
 
+def test_a_narrow_resonance_that_noise_excites_is_no_line() -> None:
+    """It rings through several segments of 2 s; compared with the second next, it was taken for a line in 3 of 8."""
+    machine = with_segments(2.0)
+    pole = np.exp((-0.006 + 1j) * 2 * np.pi * 8.3 / RATE_HZ)
+    for seed in range(8):
+        rings = lfilter(
+            [1.0], [1.0, -2 * pole.real, abs(pole) ** 2], np.random.default_rng([8, seed]).standard_normal(2 * N)
+        )
+        made = recording(3.0 * rings[N:] / rings[N:].std(), machine=machine)
+        assert check_lines(machine, [made]).verdict == "passed"
+
+
 @pytest.mark.parametrize(
     ("hz", "amplitude", "speed_hz", "new"),
     [
