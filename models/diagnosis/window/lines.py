@@ -35,8 +35,8 @@ _NEIGHBOURHOOD_HZ = 4.0
 _HARMONICS = 12
 _CHANCE = 1e-9
 # Segments whose phases are compared are an eighth of all apart, at least two, and at most this time: a mode at 10 Hz
-# that is damped by 0.3 % falls to a seventh in it, and the line of a neighbouring machine does not wander too far.
-_PART_APART, _MOST_APART_S = 8, 10.0
+# that is damped by 0.15 % falls to a seventh in it, and the line of a neighbouring machine does not wander too far.
+_PART_APART, _MOST_APART_S = 8, 20.0
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""
 _LOUD = 0.02  # part of a channel's random power above which a new line is reported
