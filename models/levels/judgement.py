@@ -77,6 +77,7 @@ class Foreign(NamedTuple):
     hides: bool = False  # whether no parameter read in the same window can be believed
     direction: str = ""  # of the sensors of a place that all have a wrong gain
     unlike: float = 0.0  # what that gain leaves of the change of 1x, see `left_of_1x`
+    held: bool = False  # whether that place is held by a bearing or support, whose stiffness may look like a gain
 
 
 class LevelJudge:
@@ -172,7 +173,8 @@ class LevelJudge:
                 more = f"{wrong[1]:.2f} times its healthy value at all frequencies, compared with the other places"
                 text = f"gain of {' and '.join(one.name for one in own)}: {more}"
                 unlike = left_of_1x(*self._turned_up(levels, state), places, *wrong) if seen else 0.0
-                return Foreign(text, hides=True, direction=own[0].direction, unlike=unlike)
+                held = own[0].location != "disc"
+                return Foreign(text, hides=True, direction=own[0].direction, unlike=unlike, held=held)
         if found or not seen:  # at another speed much differs in any case
             return Foreign(found)
         kurtosis, hidden = levels.random_kurtosis, levels.hidden_twice

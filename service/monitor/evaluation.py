@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from models.diagnosis.misfit import Rival
-from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.readings import Diagnosis, Left, no_reading
 from models.diagnosis.sensors.disagreement import is_drift
 from models.diagnosis.sensors.level import at_range_end
 from models.diagnosis.sensors.reference import WITHOUT_SIGNAL, Naming, implicated
@@ -26,6 +26,7 @@ from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
+_OR_STIFFNESS = "or the stiffness there has changed, which looks the same well below its resonance"
 _MOST_MISFIT_Z = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
 Newest = tuple[SlidingWindow, SequentialTest]
@@ -80,9 +81,18 @@ class Evaluation:
         A wrong gain scales the readings of both by one factor, and 1x as `left_of_1x` says. A bearing below its
         resonance looks the same if its damping is not known well.
         """
-        names = tuple(f"{of}_b{foreign.direction}" for of in "kc")
-        left = self.deciding.left_by(names) if foreign.direction else None
+        names, left = self._left(foreign)
         return names if left is not None and left.single <= left.common + foreign.unlike else ()
+
+    def doubted(self, foreign: Foreign) -> Foreign:
+        """The same, with the stiffness that may be the cause where none was read that would exclude it."""
+        if not foreign.held or self._left(foreign)[1] is not None:
+            return foreign
+        return foreign._replace(text=f"{foreign.text}; {_OR_STIFFNESS}")
+
+    def _left(self, foreign: Foreign) -> tuple[tuple[str, ...], Left | None]:
+        names = tuple(f"{of}_b{foreign.direction}" for of in "kc")
+        return names, self.deciding.left_by(names) if foreign.direction else None
 
     @property
     def unlike_healthy(self) -> str:

@@ -110,7 +110,9 @@ class WindowReporter:
             evaluation = self.evaluator.evaluate(used or statistics, (samples, test))
         except EstimationError as error:
             return unread(HealthState.WATCHING if self.watching else HealthState.NOT_EVALUABLE, str(error))
-        foreign = levels.foreign(samples, statistics, named=bool(test.state.findings), faulty=faulty)
+        foreign = evaluation.doubted(
+            levels.foreign(samples, statistics, named=bool(test.state.findings), faulty=faulty)
+        )
         evaluation = evaluation.named(self._machine.sensors, statistics, foreign.text, faulty)
         looks = {n: stretch_of(one, samples.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
         whole = test.settings.window_hops

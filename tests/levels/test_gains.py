@@ -2,14 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from models.levels.bands import BandLevels
+from models.levels.contact import LatestContact
 from models.levels.gains import GainReference, learn_gains, left_of_1x, wrong_gain
-from models.levels.measures import level_plan
+from models.levels.judgement import LevelJudge
+from models.levels.measures import WindowLevels, level_plan
+from models.levels.reference import learn_levels
+from models.levels.settings import LevelSettings
 from models.signals.channels import Channel
 from tests.levels.test_measures import taken
 from tests.sure import sure
@@ -24,12 +29,12 @@ CHANNELS = [
 PLAN = level_plan(CHANNELS, RATE_HZ, (10.0, 400.0))
 
 
-def window(
+def whole(
     seed: int,
     resonances_hz: Sequence[float] = RESONANCES_HZ,
     gains: Sequence[float] = (1.0, 1.0, 1.0),
     pole: float = 0.5,
-) -> BandLevels:
+) -> WindowLevels:
     """Shared noise, coloured by `pole`, and some independent noise, through a resonance at each place."""
     rng, n = np.random.default_rng([20261130, seed]), round(HOPS * HOP_S * RATE_HZ)
     shared = lfilter([1 - pole], [1, -pole], rng.standard_normal(n))
@@ -38,7 +43,11 @@ def window(
         root = 0.9 * np.exp(2j * np.pi * hz / RATE_HZ)
         force = shared + 0.1 * rng.standard_normal(n)
         columns.append(gain * lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], force))
-    return sure(taken(PLAN, 1e-6 * np.column_stack(columns), HOPS).bands)
+    return taken(PLAN, 1e-6 * np.column_stack(columns), HOPS)
+
+
+def window(*of: Any, **settings: Any) -> BandLevels:
+    return sure(whole(*of, **settings).bands)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +73,20 @@ def test_a_moved_resonance_or_a_changed_excitation_is_no_wrong_gain(reference: G
         assert wrong_gain(window(200, resonances_hz), PLACES, reference) is None
     for seed, gain, pole in ((300, 1.0, 0.5), (301, 2.0, 0.8), (302, 0.5, 0.2), (303, 1.0, 0.95)):
         assert wrong_gain(window(seed, gains=(gain,) * 3, pole=pole), PLACES, reference) is None
+
+
+@pytest.mark.parametrize(("at", "held"), [(0, True), (1, False)])
+def test_a_wrong_gain_says_whether_a_bearing_or_support_holds_its_place(
+    reference: GainReference, at: int, *, held: bool
+) -> None:
+    healthy = learn_levels("commissioned", [one.name for one in CHANNELS], [whole(10), whole(11)], reference)
+    judge, now = (
+        LevelJudge(PLAN, CHANNELS, LevelSettings()),
+        whole(150, gains=[1.2 if n == at else 1.0 for n in range(3)]),
+    )
+    found = judge.foreign(now, judge.judge(now, healthy), healthy, LatestContact(4), named=False)
+    assert found.text.startswith(f"gain of {CHANNELS[at].name}")
+    assert found.held == held
 
 
 def test_dead_channels_and_other_places_or_bands_give_no_wrong_gain(reference: GainReference) -> None:

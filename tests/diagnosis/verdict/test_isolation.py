@@ -267,6 +267,23 @@ def test_parameters_rival_a_wrong_gain_where_damping_or_1x_allows_it(c_by: float
     assert evaluation.rivals(Foreign("a line", hides=True)) == ()
 
 
+@pytest.mark.parametrize(
+    ("reading", "held", "doubted"), [(-0.14, True, False), (None, True, True), (None, False, False)]
+)
+def test_a_wrong_gain_is_not_blamed_alone_where_no_reading_excludes_the_bearing(
+    reading: float | None, *, held: bool, doubted: bool
+) -> None:
+    """A bearing well below its resonance moves inversely to its stiffness at every frequency, as with a gain."""
+    k_by = (
+        no_reading("k_by", "shape", "no equation") if reading is None else parameter_reading("k_by", "x", reading, 0.1)
+    )
+    readings, gain = (k_by, parameter_reading("c_by", "x", 0.1, 0.1)), Foreign("gain of y1", direction="y", held=held)
+    evaluation = Evaluation(Diagnosis("x", readings, covariance=0.01 * np.eye(2)), {}, (), (), None)
+    text = evaluation.doubted(gain).text
+    assert text.startswith("gain of y1")
+    assert ("the stiffness there has changed" in text) == doubted
+
+
 def test_a_cause_is_a_rival_of_the_parameters_only_if_it_explains_as_much() -> None:
     """Readings with errors of 2 %, uncorrelated; the cause lowers all of them alike."""
     cov, limits = 0.02**2 * np.eye(6), window_thresholds(1e-6, 6)
