@@ -27,6 +27,8 @@ _SEGMENTS_S = (2.0, 5.0, 10.0)  # usual one, and longer ones that fit the usual 
 _RESOLVED = 1.5 * math.pi
 """Decay of a mode over a segment, in nepers, from which its half-power bandwidth is at least the noise bandwidth of a
 Hann window (1.5 bins: F. J. Harris, Proc. IEEE 66 (1978), table 1)."""
+LONGEST_LAG_STEP_S = 0.00126
+"""Spacing of the lags at time scale 1 beyond which a kernel of level *none* has too few points."""
 _LENGTHS = ("segment_s", "hop_s", "length_s", "max_span_s")
 
 
@@ -232,7 +234,8 @@ def default_window(
     if scale != 1 and not {"lag_from_s", "lag_to_s"} & {*given}:
         found |= {name: getattr(usual, name) * scale for name in ("lag_from_s", "lag_to_s")}
     if scale != 1 or not whole(step_s * rate_hz):
-        found["lag_step_s"] = max(1, round(step_s * rate_hz)) / rate_hz
+        most = math.floor(LONGEST_LAG_STEP_S * scale * rate_hz)
+        found["lag_step_s"] = max(1, min(round(step_s * rate_hz), most)) / rate_hz
     if schedule is not None:
         found |= schedule.window(rate_hz, usual.model_copy(update={"segment_s": lengths["segment_s"]} | found))
     elif {"segment_s", "hop_s", "length_s"} & {*given}:  # multiples of each other

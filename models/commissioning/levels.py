@@ -30,7 +30,7 @@ from models.commissioning.commissioned import (
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import Identified, compare, has_angle, identify
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.lag_moments import LONGEST_LAG_STEP_S, passband_hz
+from models.diagnosis.baseline.lag_moments import passband_hz
 from models.diagnosis.baseline.learned import disagreements, learn_baseline, planes_coupled, undetermined, unsuitable
 from models.diagnosis.baseline.rows import (
     COUPLED_ROWS,
@@ -52,7 +52,7 @@ from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS, natural_frequencies
 from models.signals.channels import ACCELERATIONS
-from models.stream_settings import segment_for
+from models.stream_settings import LONGEST_LAG_STEP_S, segment_for
 
 Read = tuple[str, int, Diagnosis]  # recording, end of the window in ns, and its diagnosis
 Progress = Callable[[str, int, int], None]  # called with the present step in words, the steps done, and their total

@@ -11,7 +11,7 @@ from models.errors import MachineFileError
 from models.machine import Machine, MachineFile, load_machine, load_machine_file
 from models.physics.response import synchronous_response
 from models.physics.rotor import PARAMETERS, changed, system_A
-from models.stream_settings import WindowSettings, time_scale
+from models.stream_settings import LONGEST_LAG_STEP_S, WindowSettings, time_scale
 
 LAB = (Path(__file__).parents[2] / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
 
@@ -84,6 +84,14 @@ def test_a_machine_file_with_only_sensors_works_at_any_rate(tmp_path: Path, rate
     assert (window.segment_s, window.hop_s, window.length_s) == pytest.approx((2, 5, 60), rel=0.01)
     assert window.band_hz[0] == 3.0
     assert window.band_hz[1] < rate_hz / 2
+
+
+@pytest.mark.parametrize("rpm", [1500, 4783, 6000])
+def test_default_lags_are_close_enough_for_every_rate_that_allows_it(tmp_path: Path, rpm: int) -> None:
+    for rate_hz in (1024.0, 1536.0, 1587.0, 2048.0, 2450.0, 2500.0, 4096.0):
+        machine = fan(tmp_path, f"[operation]\nspeed_rpm = {rpm}", rate_hz=rate_hz)
+        longest_s = LONGEST_LAG_STEP_S * machine.time_scale
+        assert machine.window.lag_step_s <= longest_s or longest_s * rate_hz < 1
 
 
 def test_a_byte_order_mark_is_accepted(tmp_path: Path) -> None:

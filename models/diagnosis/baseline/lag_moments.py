@@ -22,9 +22,7 @@ from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
 
-# Times for a machine that suits the usual window; for another one, each is multiplied by its time scale.
-LONGEST_LAG_STEP_S = 0.00126  # spacing of the lags beyond which a kernel has too few points
-_SPACING_S = 0.004
+_SPACING_S = 0.004  # at time scale 1
 _FALLEN_TO = 0.1
 _FALLEN_AT = 3.0  # kernel width times the band's upper end for cos⁸: gain 1/10 there, 1/70 a third further up
 _LEAD = 0.375

@@ -6,13 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from models.diagnosis.baseline.conditions import force_spectrum, growth_of
-from models.diagnosis.baseline.lag_moments import (
-    LONGEST_LAG_STEP_S,
-    LagMoments,
-    RowWindow,
-    row_window,
-    shared_covariance,
-)
+from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow, row_window, shared_covariance
 from models.diagnosis.baseline.relation import Contribution, Relation, beyond_memory, change_of, learn_row
 from models.diagnosis.baseline.rows import (
     COUPLED_ROWS,
@@ -30,6 +24,7 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
+from models.stream_settings import LONGEST_LAG_STEP_S
 
 _FOLDS = 6
 _FEWEST_OTHERS = 2
