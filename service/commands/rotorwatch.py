@@ -321,7 +321,10 @@ def _checked(file: Path) -> str:
         machine = load_machine_file(file)
         known = knowledge_of(machine)  # a missing field of [rotor] is no error, but prevents diagnosis
         channels = f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
-        return f"machine {machine.title}, {channels}; knowledge level {known.level}: {known.text}"
+        window, (low_hz, high_hz) = machine.window, machine.window.band_hz
+        lengths = f"windows of {window.length_s:g} s every {window.hop_s:g} s, segments of {window.segment_s:g} s"
+        spectra = f"{lengths}, {low_hz:g} to {high_hz:g} Hz"
+        return f"machine {machine.title}, {channels}; {spectra}; knowledge level {known.level}: {known.text}"
     settings = load_settings(file)
     names = []
     for entry in settings.machines:
