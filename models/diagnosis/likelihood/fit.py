@@ -28,6 +28,7 @@ from models.diagnosis.likelihood.spectral_model import (
     Expected,
     SpectralModel,
     Speeds,
+    grouped,
     starting_point,
     usual_force,
 )
@@ -200,7 +201,7 @@ class LikelihoodFit:
         speed, speeds = self._speed(window), self._speeds(window)
         band = window.frequencies_hz, _near_lines(window, speed)
         scale = np.sqrt(self._checked_power(window, ~band[1]))
-        states = self._grouped(band, _count(speeds)).average(window.spectrum)
+        states = grouped(self._machine, window, self._grouped(band, _count(speeds)))
         try:
             # Trial points may lie far out; their results are checked, so no warnings are needed.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -430,7 +431,7 @@ class LikelihoodFit:
         near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
         theta = search.weights.centre.copy()
         theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
-        states = groups.average(window.spectrum)
+        states = grouped(self._machine, window, groups)
 
         def is_hopeless(steps: int, reached: Whitened) -> bool:
             return steps == _PATIENCE and bool(unexplained_at(model, search.weights, reached, states, _HOPELESS)[0])
@@ -481,7 +482,7 @@ def _count(speed: Speeds) -> int:
 
 def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     """Estimated spectra in the model's groups and units."""
-    return model.observed(model.groups.average(window.spectrum))
+    return model.observed(grouped(model.machine, window, model.groups))
 
 
 def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:

@@ -32,10 +32,12 @@ from scipy.special import eval_legendre
 
 from models.diagnosis.likelihood.motions import BinGroups, Motions
 from models.diagnosis.window.moments import ComplexArray, through
+from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.excitation import low_pass, low_pass_slopes
-from models.physics.rotor import M_matrix, P_matrix, Q_matrix, Q_shaft
+from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
+from models.signals.channels import parts_seen
 
 # Parameters that shape the spectra, in the order of the parameter vector.
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
@@ -115,6 +117,8 @@ class SpectralModel:
         lever = rotor.shaft_length_m / 3
         self.force_unit = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
         self._M, self._Q, self._Q_shaft = M_matrix(rotor), Q_matrix(rotor), Q_shaft(rotor)
+        made = np.array(motions.states)[_integrated(machine, motions.states)]
+        self._integrated = np.isin(motions.dofs, [STATE_INDEX[state] % 6 for state in made])
         self._bearing = np.array([rotor.k_by_N_per_m, rotor.c_by_N_s_per_m, rotor.k_bz_N_per_m, rotor.c_bz_N_s_per_m])
         self.cutoff_at = len(STRUCTURAL)
         self.order_at = self.cutoff_at + 1
@@ -146,6 +150,9 @@ class SpectralModel:
         self._place = place.reshape(self._w.shape) + self._distinct_w.size * speed
         self.centre = 2 * np.pi * groups.centre_hz
         self._factor = self.motions.factor(self._w, self.centre[:, None])
+        if self._integrated.any():  # an acceleration over jω of the group's centre, see `grouped`
+            at_centre = self.motions.factor(self._w**2 / self.centre[:, None], self.centre[:, None])
+            self._factor = np.where(self._integrated, at_centre, self._factor)
         shares = self.motions.shares(self.centre)
         self._motion_of = np.array([shares[state][0] for state in self.motions.states])
         self._share = np.stack([shares[state][1] for state in self.motions.states], axis=1)
@@ -301,6 +308,27 @@ class SpectralModel:
         pairs = (columns @ columns.conj().swapaxes(1, 2)).reshape(-1, self.n, 6, self.n, 6)[:, :, ROWS, :, COLUMNS]
         out[self.level_at] = twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
         return out
+
+
+def grouped(machine: Machine, window: WindowStatistics, groups: BinGroups) -> ComplexArray:
+    """Estimated cross-spectra of a window's states, averaged over each group, shape (n_groups, n_states, n_states).
+
+    Accelerations were divided by jω of their bins. What leaks from a narrow resonance into several bins keeps its phase
+    and its ratio to a displacement only if one ω divides all bins of a group: that of its centre.
+    """
+    made, spectrum = _integrated(machine, window.states), window.spectrum
+    if made.any():
+        turn = np.ones(spectrum.shape[:2])
+        for (first, end), centre_hz in zip(groups.edges, groups.centre_hz, strict=True):
+            turn[first:end, made] = window.frequencies_hz[first:end, None] / centre_hz
+        spectrum = spectrum * turn[:, :, None] * turn[:, None, :]
+    return groups.average(spectrum)
+
+
+def _integrated(machine: Machine, states: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+    """Which states are velocities that no sensor measures: integrals of accelerations."""
+    measured = {state for sensor in machine.sensors for state in parts_seen(sensor)}
+    return np.array([state.endswith("_dot") and state not in measured for state in states])
 
 
 def _noise_shapes(frequencies_hz: FloatArray, low_hz: float, high_hz: float, corners: int) -> FloatArray:
