@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_bands
@@ -30,6 +31,8 @@ _RUNOUT = 0.03  # least change of the log gain to reject them, and largest stand
 _TOLD_APART = 2 * math.log(1e3)  # least fall of χ² with which a model of the phases is preferred: 1000 times likelier
 _MOST_ACROSS = 0.15  # largest cross-axis sensitivity that is corrected for: more has another cause
 _PLANES, _RATES = str.maketrans("yz", "zy"), {"": 0, "dot": 1, "ddot": 2}
+_ONE_SPEED, _LEAKS = 0.01, 2  # relative change of speed from which on a line has moved; bins into which it leaks
+_UNSURE = 1e3  # factor on the error of a hop that does not count
 _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann segments keep
 _FLOOR = 1e-10
 
@@ -283,6 +286,8 @@ def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[
 
     The first way divides the cross-power by the power of the first sensor, so noise of the first lowers it; the second
     way divides by the power of the second. A change of gain shows in both, a change of one sensor's noise in one.
+
+    Bands through which the 1x passes as the speed changes do not count, nor do hops of unknown speed among others.
     """
     bands, number = reading.bands, motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
@@ -290,10 +295,28 @@ def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[
     aligned = reading.transfer.conj() / np.exp(reading.log_gain)
     powers = np.stack([hop[number] for hop in window.pair_powers])
     common = np.real(aligned * powers[:, :, 1])
-    averages = bands.averages / len(powers)
-    over_first = _course(common, powers[:, :, 0].real, incoherent, averages)
-    falls, error = _course(common, powers[:, :, 2].real, incoherent, averages)
-    return over_first, (-falls, error)
+    counts = ~_passed_by_1x(window)
+    common, powers, averages = common[:, counts], powers[:, counts], bands.averages[counts] / len(powers)
+    rises, error = _course(common, powers[:, :, 0].real, incoherent[counts], averages)
+    falls, other_error = _course(common, powers[:, :, 2].real, incoherent[counts], averages)
+    known = np.isfinite(window.hop_speed_rad_s)
+    unsure = np.where(known | ~known.any(), 1.0, _UNSURE)
+    return (rises, error * unsure), (-falls, other_error * unsure)
+
+
+def _passed_by_1x(window: WindowStatistics) -> npt.NDArray[np.bool_]:
+    """Bands of a pair through which a changing speed takes the 1x, shape (n_bands,); none if that leaves none.
+
+    The line leaks into bins beside it, whose jω is not its own: it falsifies the gain, by as much as the line is off.
+    """
+    first_hz = window.frequencies_hz[pair_bands(window.frequencies_hz.size)]
+    step_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
+    speeds_hz = np.abs(window.hop_speed_rad_s[np.isfinite(window.hop_speed_rad_s)]) / (2 * np.pi)
+    if not speeds_hz.size or np.ptp(speeds_hz) < _ONE_SPEED * speeds_hz.max():
+        return np.full(first_hz.size, False)
+    below = first_hz < speeds_hz.max() + _LEAKS * step_hz
+    passed = below & (np.append(first_hz[1:], np.inf) > speeds_hz.min() - _LEAKS * step_hz)
+    return np.asarray(passed & ~passed.all(), dtype=np.bool_)
 
 
 def _course(
