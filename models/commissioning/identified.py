@@ -38,7 +38,7 @@ _STARTS: tuple[_Start, ...] = tuple(
 )
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
-_NO_STIFFNESS = 1e5  # N/m, placeholder in a plane without any sensor, whose stiffness is never read
+_NO_STIFFNESS = 1e5  # N/m, placeholder where no plane has a sensor
 _E = PARAMETERS.index("e")
 _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
@@ -286,7 +286,6 @@ def _from_peak(
     for axis, mode in zip("yz", modes, strict=True):
         columns = [n for n, name in enumerate(window.states) if name[0] == axis]
         if not columns:
-            found[f"k_b{axis}_N_per_m"] = fields.get("k_by_N_per_m") or found.get("k_by_N_per_m") or _NO_STIFFNESS
             continue
         density = window.spectrum[:, columns[0], columns[0]].real
         peak_rad_s = 2 * np.pi * float(window.frequencies_hz[int(np.argmax(density))])
@@ -300,7 +299,9 @@ def _from_peak(
             ),
         )
         found[f"k_b{axis}_N_per_m"] = rigid * best
-    return found
+    # A plane without a sensor is as stiff as the other: the gyroscopic moments show something of it.
+    like = next(iter(found.values()), _NO_STIFFNESS)
+    return {name: found.get(name, fields.get(name, like)) for name in ("k_by_N_per_m", "k_bz_N_per_m")}
 
 
 def _natural(fields: dict[str, float], axis: str, mode: int) -> float:

@@ -157,6 +157,18 @@ def test_a_damped_rotor_is_identified_with_sensors_at_its_bearing_alone() -> Non
     assert (rotor.c_by_N_s_per_m, rotor.c_bz_N_s_per_m) == pytest.approx((160.0, 160.0), rel=0.25)
 
 
+def test_a_heavy_rotor_with_sensors_in_the_vertical_alone_is_identified() -> None:
+    """It moves like the rotor kit, at 16 times its masses and stiffness."""
+    rotor = sure(PARTIAL.rotor)
+    heavier = {name: 16 * getattr(rotor, name) for name in ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2")}
+    heavier["shaft_diameter_m"] = 2 * sure(rotor.shaft_diameter_m)
+    heavy = PARTIAL.model_copy(update={"rotor": rotor.model_copy(update=heavier)})
+    file, vertical = with_sensors(heavy, stream(70.0, 41), lambda sensor: sensor.direction != "y")
+    made = commissioned(file, recording(file, vertical))
+    assert made.report.verdict == "limited"  # by its length alone
+    assert sure(made.machine).rotor.k_bz_N_per_m == pytest.approx(16 * LAB.rotor.k_bz_N_per_m, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("change", "directions"),
     [
