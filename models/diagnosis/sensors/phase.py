@@ -154,7 +154,9 @@ def _line_at_other_speed(
     rows = power[: count * _AROUND_BINS].reshape(count, _AROUND_BINS, -1)
     ratio = (rows / np.maximum(np.median(rows, axis=1, keepdims=True), np.finfo(float).tiny)).mean(axis=2).ravel()
     at = int(ratio[2:-2].argmax()) + 2
-    if ratio[at] < _LINE_STRENGTH:
+    f = window.frequencies_hz
+    turned = np.min(np.abs(np.abs(window.hop_speed_rad_s) / (2 * np.pi) - f[at])) <= f[1] - f[0]
+    if ratio[at] < _LINE_STRENGTH or turned:  # the shaft may have turned at that speed earlier in the window
         return None
     line, _ = _surroundings(window, there, at)
     seen = np.sqrt(2 * np.maximum(line, 0.0)) / amplitude

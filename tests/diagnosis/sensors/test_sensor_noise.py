@@ -281,3 +281,20 @@ def test_a_1x_that_moves_beside_low_resonances_is_no_gain_drift() -> None:
     samples[100_000:, 6] *= 1.05
     (finding,) = sensor_findings(statistics(machine, samples))
     assert (finding.kind, finding.states) == (FaultKind.GAIN, ("y2", "y2_dot"))
+
+
+def test_a_1x_that_shrinks_as_the_shaft_leaves_a_resonance_is_no_fault_of_the_angle() -> None:
+    """Its line at the earlier speed is not that of another shaft."""
+    plan, rng = plan_of("lab"), np.random.default_rng(3224002)
+    plan = replace(plan, states=("y1",), columns=plan.columns[:1], scales=plan.scales[:1])
+    t_s = np.arange(round((WINDOW_S + MORE_S) * plan.rate_hz)) / plan.rate_hz
+    noise = 2e-6 * rng.standard_normal(t_s.size)
+
+    def turning(hz: FloatArray, size: FloatArray) -> WindowStatistics:
+        theta = 2 * np.pi * np.cumsum(hz) / plan.rate_hz
+        (window,) = windows_in(plan, np.stack([1e-4 * size * np.cos(theta) + noise, np.mod(theta, 2 * np.pi)], axis=1))
+        return window
+
+    steady = turning(np.full(t_s.size, 22.0), np.ones(t_s.size))
+    slower = turning(np.interp(t_s, [17.5, 17.6], [22.0, 21.9]), np.interp(t_s, [17.5, 17.6], [1.0, 0.02]))
+    assert sensor_findings(slower, learn_sensor_reference([steady])) == ()
