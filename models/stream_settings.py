@@ -126,13 +126,13 @@ class Schedule(BaseModel, extra="forbid", frozen=True):
         A hop is a snapshot, a window twelve of them. Seven half-overlapping segments or more go into a snapshot, and
         the longest lag is at most a quarter of it.
         """
-        segment_s = min(usual.segment_s, 2 * math.floor(self.on_s * rate_hz / 8) / rate_hz)
+        halves = min(round(usual.segment_s / 2 * rate_hz), math.floor(self.on_s * rate_hz / 8))
         lag_to_s = min(usual.lag_to_s, math.floor(self.on_s * rate_hz / 4) / rate_hz)
         return {
             "length_s": 12 * self.every_s,
             "hop_s": self.every_s,
             "max_span_s": 18 * self.every_s,
-            "segment_s": max(segment_s, 2 / rate_hz),
+            "segment_s": 2 * max(halves, 1) / rate_hz,
             "lag_to_s": max(lag_to_s, 2 / rate_hz),
             "lag_from_s": min(usual.lag_from_s, math.floor(lag_to_s * rate_hz / 8) / rate_hz),
         }

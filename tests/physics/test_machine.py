@@ -231,6 +231,12 @@ def test_snapshots_of_a_fast_machine_have_its_band_and_lags(tmp_path: Path) -> N
     assert (window.lag_from_s, window.lag_to_s) == pytest.approx((0.002, 0.025))
 
 
+@pytest.mark.parametrize("rate_hz", [6400 / 3, 51200 / 3, 2000.5])
+def test_snapshots_at_rates_that_do_not_divide_have_whole_segments(tmp_path: Path, rate_hz: float) -> None:
+    window = fan(tmp_path, "[schedule]\non_s = 12.0\nevery_s = 60.0", rate_hz=rate_hz).window
+    assert window.segment_s == pytest.approx(2, rel=1e-3)
+
+
 @pytest.mark.parametrize(("rpm", "rate_hz"), [(15000, 60.0), (60000, 100.0), (60000, 50.0)])
 def test_a_rate_too_low_for_a_fast_machine_leaves_the_usual_window(tmp_path: Path, rpm: int, rate_hz: float) -> None:
     machine, usual = (fan(tmp_path, f"[operation]\nspeed_rpm = {one}", rate_hz=rate_hz) for one in (rpm, 1500))
