@@ -155,7 +155,7 @@ def _line_at_other_speed(
     ratio = (rows / np.maximum(np.median(rows, axis=1, keepdims=True), np.finfo(float).tiny)).mean(axis=2).ravel()
     at = int(ratio[2:-2].argmax()) + 2
     f = window.frequencies_hz
-    turned = np.min(np.abs(np.abs(window.hop_speed_rad_s) / (2 * np.pi) - f[at])) <= f[1] - f[0]
+    turned = np.any(np.abs(np.abs(window.hop_speed_rad_s) / (2 * np.pi) - f[at]) <= f[1] - f[0])
     if ratio[at] < _LINE_STRENGTH or turned:  # the shaft may have turned at that speed earlier in the window
         return None
     line, _ = _surroundings(window, there, at)

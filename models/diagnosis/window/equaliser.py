@@ -27,14 +27,15 @@ class Equaliser:
         self._delay_s = np.array([(one.delay_us or 0.0) * 1e-6 for one in sensors])
 
     def response(self, frequency_hz: FloatArray) -> _ComplexArray:
-        """Complex gain of each sensor, shape (..., n); 1 where the frequency is unknown (nan).
+        """Complex gain of each sensor, shape (..., n); 1 where the frequency is unknown (nan) or 0.
 
         Frequencies, shape (...), are negative for a shaft angle that decreases.
         """
-        f = frequency_hz[..., np.newaxis]
-        below = self._corner_hz / (1j * np.where(f == 0, np.nan, f))
+        known = (np.isfinite(frequency_hz) & (frequency_hz != 0))[..., np.newaxis]
+        f = np.where(known, frequency_hz[..., np.newaxis], 1.0)
+        below = self._corner_hz / (1j * f)
         damped = np.where(self._order == 2, 1 + math.sqrt(2) * below + below**2, 1 + below)
-        return np.asarray(np.nan_to_num(np.exp(-2j * np.pi * f * self._delay_s) / damped, nan=1.0), dtype=np.complex128)
+        return np.asarray(np.where(known, np.exp(-2j * np.pi * f * self._delay_s) / damped, 1.0), dtype=np.complex128)
 
     def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
         """What the sensors' responses remove from the correlations, shape (n_hops, n_lags, n, n).

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.window.equaliser import Equaliser
 from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
@@ -78,6 +79,13 @@ def test_declared_responses_are_corrected_in_a_window(without_angle: bool, speed
     assert all(one < 0.06 for one in apart(statistics(declared, seen), true))
     # Responses that are not declared cause large errors.
     assert all(one > 0.1 for one in apart(statistics(true_machine, seen), true))
+
+
+def test_at_an_unknown_speed_there_is_no_response_and_no_warning() -> None:
+    channels = machine(declared=True).sensors[:8]
+    found = Equaliser(channels).response(np.array([np.nan, 0.0, 22.0]))
+    np.testing.assert_array_equal(found[:2], np.ones((2, 8)))
+    assert (np.abs(found[2]) < 1).any()
 
 
 def test_the_latest_hops_have_the_same_news_behind_declared_responses() -> None:
