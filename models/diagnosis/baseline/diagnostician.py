@@ -35,6 +35,7 @@ from models.signals.block import FloatArray
 _SINGLE = 2.326  # standard errors beyond which no single parameter explains a window (one per cent, one-sided)
 _COMMON = 2.576  # standard errors within which a common factor explains it (one per cent, two-sided)
 _MOST_LOSS = -0.95
+_SURE = 3.0  # standard errors up to which the size of a change is not in doubt
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +179,8 @@ class BaselineDiagnostician:
             own = [self._own_of[name] for name in names[: values.size]]
             wider = np.array([max(least if one.terms else 1.0, one.one_source if alone else 1.0) for one in own])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
-        elsewhere = through @ np.diag(self._other_condition_variances(bearing.values, same=same)) @ through.T
+        errors = np.sqrt(np.diag(total)[: bearing.values.size])
+        elsewhere = through @ np.diag(self._relation_variances(bearing.values, errors, same=same)) @ through.T
         # A stiffness that grew with the motion has really changed, so the unbalance is read with it and gets no part of
         # this variance. Under the commissioned force, growth that commissioning did not show is not assumed.
         seen, unseen = self._growth_variances(changes)
@@ -186,11 +188,11 @@ class BaselineDiagnostician:
         total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
-        errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+        stated = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         parameters = tuple(
             no_reading(name, self.by, reasons[name])
             if reasons[name]
-            else parameter_reading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
+            else parameter_reading(name, self.by, float(values[names.index(name)]), stated[names.index(name)])
             for name in self._parameters
         )
         diagnosis = Diagnosis(
@@ -222,11 +224,15 @@ class BaselineDiagnostician:
         now = force_spectrum([one.moments.of for one in seen], [one.combination for one in seen])
         return alike(self._baseline.force, now)
 
-    def _other_condition_variances(self, changes: FloatArray, *, same: bool) -> FloatArray:
-        """Variances from the relations' errors in other conditions, over the number of conditions learned from."""
+    def _relation_variances(self, changes: FloatArray, errors: FloatArray, *, same: bool) -> FloatArray:
+        """Variances from the relations' errors: in other conditions, over the number learned from, and of size."""
         own = [self._own_of[name] for name in self._names]
-        errors = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
-        return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
+        elsewhere = np.array([0.0 if same and not one.always else one.elsewhere for one in own])
+        left = np.maximum(1 + changes, 1 + _MOST_LOSS)
+        # Nothing is in doubt of the size of no change, so that this error never hides one.
+        beyond = np.maximum(0.0, np.abs(np.log(left)) - _SURE * errors / left)
+        of_size = np.array([one.of_size for one in own]) * beyond
+        return np.asarray(left**2 * (elsewhere**2 / self._conditions + of_size**2), dtype=np.float64)
 
     def _growth_variances(self, changes: Sequence[RowChange | None]) -> tuple[FloatArray, FloatArray]:
         """Variances of stiffnesses at another power of motion: from growth that was seen, and from growth unseen."""

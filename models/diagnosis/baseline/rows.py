@@ -129,6 +129,9 @@ class Own:
     # and `elsewhere` only to a stiffness, as a bearing is never quite linear.
     elsewhere: float = 0.0
     always: bool = False  # whether `elsewhere` is applied under the commissioned force, too
+    # Standard error of the logarithm of a change, relative to that logarithm: the relation stands for omitted parts of
+    # the machine, too, so that a stiffness is in units of more or less than the bearing's own (decision 0012).
+    of_size: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +169,7 @@ def _bearing(plane: str, number: str, direction: str) -> Row:
         Term((Motion(two, 0), Motion(one, 0, -1.0)), spread=0.5, without=0.02),
     )
     own = (
-        Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True),
+        Own(f"k_b{plane}", (0,), elsewhere=0.005, always=True, of_size=0.15),
         Own(f"c_b{plane}", (1,), one_source=1.6, elsewhere=0.03),
     )
     return Row(plane, number, f"bearing and disc, {direction}", terms, own)

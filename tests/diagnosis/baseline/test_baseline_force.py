@@ -16,6 +16,7 @@ from models.diagnosis.baseline.conditions import alike
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.baseline.stored import Baseline
+from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
@@ -67,6 +68,18 @@ def test_damping_is_more_precise_under_the_commissioned_force() -> None:
     assert here.elsewhere["k_by"] > 0
     reading = next(one for one in here.evaluable if one.name == "c_by")
     assert abs(sure(reading.relative_change) + 0.2) < 3 * sure(reading.standard_error)
+
+
+@pytest.mark.parametrize("change", [-0.3, 0.3])
+def test_interval_of_a_changed_stiffness_allows_for_what_the_relation_omits(change: float) -> None:
+    (window,) = windows(condition(3, k_by=change), 1, 3230900)
+    found = BaselineDiagnostician(baseline(3)).diagnose(window)
+    reading = next(one for one in found.evaluable if one.name == "k_by")
+    assert abs(sure(reading.relative_change) - change) < 2 * sure(reading.standard_error)
+    assert isolate_window(found, 1e-6).changed == ("k_by",)
+    # the other reading has no error of size, as it has not changed
+    other = next(one for one in found.evaluable if one.name == "k_bz")
+    assert sure(other.standard_error) < 0.02
 
 
 def test_only_one_condition_has_a_force_and_records_without_one_omit_it() -> None:
