@@ -132,7 +132,7 @@ def _models(frequencies: bytes) -> tuple[FloatArray, FloatArray]:
     return np.log(flat).mean(axis=-1), 1 / flat
 
 
-_ITERATIONS = 8
+_ITERATIONS, _HALVED = 8, 16
 _FITS = 3.0  # standard deviations by which χ² of a relation that fits may exceed its expectation
 _LAG_ROUNDS = 2
 _LONGER_LAGS_S = (0.02, 0.028, 0.036, LONGEST_LAG_FROM_S)
@@ -409,16 +409,23 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
         unchanged |= first.unchanged
         if (first.fits or first.unchanged) and not change.fits:
             believed = change_of(row, relation, first.moments)
-    errors = zip(row.own, believed.error(relation), strict=True)
-    if unchanged and any(error > LOST for own, error in errors if 0 in own.terms):
+    if row.own[0].terms != (0,) or believed.error(relation)[0] <= LOST:
+        return believed
+    if unchanged:
         raise EstimationError(f"{row.title}: this window does not determine it at lags beyond the memory of its force")
-    return believed
+    halved = change_of(row, relation, believed.moments, halved=True)
+    # Where sensors are swapped or reversed, a loss of all stiffness may fit as well.
+    remains = 1 + halved.change[0] > 2 * halved.error(relation)[0]
+    return halved if halved.fits and remains else believed
 
 
-def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: bool = True) -> RowChange:
+def change_of(
+    row: Row, relation: Relation, moments: LagMoments, *, stretched: bool = True, halved: bool = False
+) -> RowChange:
     """Read the change from given moments.
 
-    Widening the errors to agree with the criterion (`stretching`) takes most of the time.
+    Widening the errors to agree with the criterion (`stretching`) takes most of the time. After a large change, each
+    estimate may give weights that lead far away, and so on in circles; `halved` steps lead to where both agree.
 
     Raises
     ------
@@ -435,7 +442,7 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
     Z = moments.values @ signatures
     uncertain = X @ relation.covariance @ X.T
     d, widening = np.zeros(len(row.own)), 1.0
-    for _ in range(_ITERATIONS // 2):
+    for _ in range(_HALVED if halved else _ITERATIONS // 2):
         combination = signatures @ np.concatenate([[1.0], -d])
         own_covariance = moments.covariance(combination)
         kept = telling(own_covariance)
@@ -448,6 +455,8 @@ def change_of(row: Row, relation: Relation, moments: LagMoments, *, stretched: b
         d, covariance = _least_squares(Q, C, np.zeros((d.size, d.size)))
         if np.all(np.abs(d - before) <= _CONVERGED * np.sqrt(np.abs(np.diag(covariance)))):
             break
+        if halved:
+            d = (before + d) / 2
     if not np.all(np.diag(covariance) > 0):
         raise EstimationError(f"{row.title}: the bearing hardly moves in this window")
     projection = np.zeros((d.size, len(Z)))

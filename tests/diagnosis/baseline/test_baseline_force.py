@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import RunCondition
+from benchmarks.finite_elements.rotor import Disc, changed_rotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline import relation
@@ -20,7 +21,7 @@ from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import FloatArray
-from tests.diagnosis.baseline.fe_rotor import windows_under
+from tests.diagnosis.baseline.fe_rotor import Excitation, recorded, windows_under
 from tests.sure import sure
 
 ROTOR = rotor_named("overhung")
@@ -80,6 +81,28 @@ def test_interval_of_a_changed_stiffness_allows_for_what_the_relation_omits(chan
     # the other reading has no error of size, as it has not changed
     other = next(one for one in found.evaluable if one.name == "k_bz")
     assert sure(other.standard_error) < 0.02
+
+
+def test_large_change_is_read_where_hardly_any_force_acts_at_the_bearing() -> None:
+    healthy, c = rotor_named("between"), 0.6 * 20**0.5
+    bearings = tuple(
+        replace(one, k_y=20 * one.k_y, k_z=20 * one.k_z, c_y=c * one.c_y, c_z=c * one.c_z, housing_kg=2.0)
+        for one in healthy.bearings
+    )
+    disc = Disc(node=3, mass_kg=4.0, radius_m=0.08, unbalance_kg_m=4e-5)
+    stiff = replace(healthy, bearings=bearings, discs=(disc,), diameter_m=0.03)
+
+    def at_the_disc(cutoff_hz: float) -> Excitation:
+        return Excitation(cutoff_hz, ((0.1, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.1, 0), (0, 0, 0, 0.7)))
+
+    learned = [recorded(stiff, at_the_disc(cutoff_hz), seed, 2) for cutoff_hz, seed in ((140, 3230011), (100, 3230012))]
+    monitor = BaselineDiagnostician(learn_baseline([*learned[0], *learned[1]], ["one", "one", "two", "two"]))
+    window = recorded(changed_rotor(stiff, {"k_by": 0.4}), at_the_disc(120.0), 3230013, 2)[0]
+    found = monitor.diagnose(window)
+    assert found.unexplained == ""
+    reading = next(one for one in found.evaluable if one.name == "k_by")
+    assert abs(sure(reading.relative_change) - 0.4) < 2 * sure(reading.standard_error) < 0.25
+    assert isolate_window(found, 0.01).changed == ("k_by",)
 
 
 def test_only_one_condition_has_a_force_and_records_without_one_omit_it() -> None:
