@@ -35,7 +35,7 @@ _NEIGHBOURHOOD_HZ = 4.0
 _HARMONICS = 12
 _CHANCE = 1e-9
 # Segments whose phases are compared are an eighth of all apart, at least two, and at most this time: a mode at 10 Hz
-# that is damped by 0.15 % falls to a seventh in it, and the line of a neighbouring machine does not wander too far.
+# that is damped by 0.15 % falls to a seventh in it. Over longer times, a neighbouring machine's line may wander, too.
 _PART_APART, _MOST_APART_S = 8, 20.0
 _NEARLY_ALL, _OTHER_WAY, _TURNS = 0.8, 0.2, 1.5
 """Least part that turns one way, largest part of that which turns the other way, and least number of turns."""

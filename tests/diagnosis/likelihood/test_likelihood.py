@@ -55,8 +55,8 @@ def test_the_expected_spectrum_of_a_narrow_mode_is_its_average_under_the_kernel(
     groups = group_bins(frequencies_hz, machine, np.zeros(frequencies_hz.size, dtype=bool), 1.0)
     modes_hz, ratios = natural_frequencies(rotor, machine.operation.speed_rad_s)
     first = int(np.argmin(modes_hz))
-    offsets = np.linspace(-2.5, 2.5, 20_001)  # avoids ±1, where the kernel's formula is 0 / 0
-    offsets = offsets[np.abs(np.abs(offsets) - 1) > 1e-9]
+    offsets = np.linspace(-2.5, 2.5, 20_001)
+    offsets = offsets[np.abs(np.abs(offsets) - 1) > 1e-9]  # at ±1 the kernel's formula is 0 / 0
     kernel = (np.sinc(offsets) / (1 - offsets**2)) ** 2
     for shift in (0.0, 0.5):
         at_hz = frequencies_hz[np.argmin(np.abs(frequencies_hz - modes_hz[first]))] + shift * 0.2
