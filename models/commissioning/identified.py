@@ -31,11 +31,13 @@ _MOST_TURNED_DEG = 20.0  # between healthy windows; more is another zero of the 
 _MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
 _Start = tuple[float, float, int, int]
 # Damping ratios of the planes, and which of their modes the strongest peaks are; the next where one is too far off.
-_STARTS: tuple[_Start, ...] = tuple(
-    (*damping, *modes)
-    for modes in ((0, 0), (1, 1), (0, 1), (1, 0))
-    for damping in ((0.05, 0.05), (0.2, 0.2), (0.05, 0.2), (0.2, 0.05))
+_DAMPING = ((0.05, 0.05), (0.2, 0.2), (0.05, 0.2), (0.2, 0.05), (0.01, 0.01))
+_MODES = ((0, 0), (1, 1), (0, 1), (1, 0), (0, 2), (2, 0))
+_STARTS: tuple[_Start, ...] = (
+    *((*damping, *_MODES[0]) for damping in _DAMPING),
+    *((*damping, *modes) for damping in _DAMPING for modes in _MODES[1:]),
 )
+_UNSEEN = (1.0, 0.7, 1.4)  # stiffness of a plane without a sensor over that of the other, by its `mode`
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
 _NO_STIFFNESS = 1e5  # N/m, placeholder where no plane has a sensor
@@ -299,9 +301,12 @@ def _from_peak(
             ),
         )
         found[f"k_b{axis}_N_per_m"] = rigid * best
-    # A plane without a sensor is as stiff as the other: the gyroscopic moments show something of it.
+    # A plane without a sensor is about as stiff as the other: the gyroscopic moments show something of it.
     like = next(iter(found.values()), _NO_STIFFNESS)
-    return {name: found.get(name, fields.get(name, like)) for name in ("k_by_N_per_m", "k_bz_N_per_m")}
+    return {
+        name: found.get(name, fields.get(name, _UNSEEN[mode] * like))
+        for name, mode in zip(("k_by_N_per_m", "k_bz_N_per_m"), modes, strict=True)
+    }
 
 
 def _natural(fields: dict[str, float], axis: str, mode: int) -> float:

@@ -174,6 +174,7 @@ def test_a_heavy_rotor_with_sensors_in_the_vertical_alone_is_identified() -> Non
     [
         ({}, [(-0.4, -0.8, 0.0, 0.3, -0.3, 0.0), (0.8, 0.4, 0.0, 0.3, -0.3, 0.0)]),  # z moves in its second mode
         ({"k_by_N_per_m": 38e3, "c_by_N_s_per_m": 130.0, "k_bz_N_per_m": 145e3, "c_bz_N_s_per_m": 20.0}, []),
+        ({"c_by_N_s_per_m": 3.0, "c_bz_N_s_per_m": 3.0}, []),
     ],
 )
 def test_a_rotor_whose_first_guess_is_far_off_is_identified_from_another_one(

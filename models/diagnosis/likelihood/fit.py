@@ -180,19 +180,26 @@ class LikelihoodFit:
         if (again or (followed and self._misfits == 1)) and not afresh:
             found = self._retried(window, found, self._corners, found.misfit_z or 0.0)
         misfit_z = found.misfit_z or 0.0
+        if afresh and misfit_z > _DOUBTFUL and self._latest is not None:
+            # With the forces that it has found there may be a better maximum near the nominal rotor.
+            nominal = np.concatenate([np.zeros(len(STRUCTURAL)), self._latest[1].theta[len(STRUCTURAL) :]])
+            found = self._retried(window, found, self._corners, misfit_z, nominal)
+            misfit_z = found.misfit_z or 0.0
         if self._corners < CORNERS and (again or afresh) and misfit_z > _DOUBTFUL and (first or not found.unexplained):
             # Perhaps the noise has a colour of more than one corner.
             found = self._retried(window, found, CORNERS, min(misfit_z, MOST_MISFIT))
         return found
 
-    def _retried(self, window: WindowStatistics, found: Diagnosis, corners: int, most_misfit: float) -> Diagnosis:
-        """Return and keep what a cold search finds if it misfits by less than `most_misfit`, otherwise `found`."""
+    def _retried(
+        self, window: WindowStatistics, found: Diagnosis, corners: int, misfit_z: float, start: FloatArray | None = None
+    ) -> Diagnosis:
+        """Return and keep what a search, cold or from `start`, finds with less than `misfit_z`, otherwise `found`."""
         cold = copy(self)
         cold.reset()
-        cold._corners = corners
+        cold._last, cold._corners = start, corners
         with suppress(EstimationError):
             other = cold._searched(window)
-            if not other.unexplained and (other.misfit_z or 0.0) < most_misfit:
+            if not other.unexplained and (other.misfit_z or 0.0) < misfit_z:
                 vars(self).update(vars(cold))
                 return other
         return found

@@ -21,7 +21,7 @@ from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed, natural_frequencies
 from models.signals.block import FloatArray
 from models.signals.channels import parts_seen, with_channel_names
-from simulator.scenario import Event, Scenario
+from simulator.scenario import Event, Scenario, load_scenario
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario, simulate_window
 from tests.commissioning.rotor_kit import mounted
 from tests.sure import sure
@@ -254,6 +254,20 @@ def test_a_narrow_hump_of_the_forces_beside_a_mode_is_within_the_model(name: str
     hump = {"hump_share": 0.4, "hump_hz": hump_hz, "hump_damping": 0.1}
     sources = tuple(one.model_copy(update=hump) for one in drawn.sources)
     assert_within_the_model(machine, drawn.model_copy(update={"sources": sources}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, *(pytest.param(number, marks=pytest.mark.long) for number in (2, 3))])
+def test_a_plane_without_sensors_is_read_near_its_nominal_values(number: int) -> None:
+    """Where one plane alone is measured, there are maxima at which the other is 10 % softer or stiffer."""
+    rotor = LAB.rotor.model_copy(update={"k_bz_N_per_m": 47.8e3, "c_by_N_s_per_m": 16.5, "c_bz_N_s_per_m": 16.5})
+    vertical = tuple(one for one in LAB.sensors if one.direction != "y")
+    machine = LAB.model_copy(update={"rotor": rotor, "sensors": vertical})
+    scenario, _ = load_scenario("healthy")
+    force = {"order": 3, "cutoff_hz": 136.0, "direction": (0.64, 0.36, 0.0, -0.31, -0.61, 0.0)}
+    source = scenario.sources[0].model_copy(update=force)
+    healthy = scenario.overridden(seed=7_700_040 + number, duration_s=65.0, faults=())
+    assert_within_the_model(machine, healthy.model_copy(update={"sources": (source,)}))
 
 
 @pytest.mark.slow
