@@ -108,26 +108,29 @@ def _settled(
         If the guess is too far off for the windows to be read, or the parameters do not settle.
     """
     diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
-    for number in range(_ROUNDS):
+    for number in range(1, _ROUNDS + 1):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
         values, covariance = together.estimate
         moves = dict(zip(together.names, values.tolist(), strict=True))
         whole, diagnoses = _moved(whole, moves, windows, sized=sized)
-        progress(number + 1, _ROUNDS)
-        if max(abs(value) for value in moves.values()) < _SETTLED:
+        progress(number, _ROUNDS)
+        restless, *others = sorted(moves, key=lambda name: -abs(moves[name]))
+        if abs(moves[restless]) < _SETTLED:
             break
-    else:
-        restless = max(moves, key=lambda name: abs(moves[name]))
         turned = [one.unbalance.turned_deg or 0.0 for one in diagnoses if one.unbalance and one.unbalance.turned]
-        why = "masses or shaft of [rotor] may be wrong, or the machine is not a bearing with an overhung disc"
-        if restless == "e" and max(turned, default=0.0) - min(turned, default=0.0) > _MOST_TURNED_DEG:
-            why = (
-                f"its heavy spot is at angles that differ by {max(turned) - min(turned):.0f}°: the zero of the shaft "
-                "angle must be the same in all recordings, as with one pulse per revolution; or leave the angle out"
+        apart_deg = max(turned, default=0.0) - min(turned, default=0.0)
+        other_zeros = restless == "e" and apart_deg > _MOST_TURNED_DEG
+        # The mean of vectors that are turned so far apart is shorter than each of them, in every further round as well.
+        if number == _ROUNDS or (other_zeros and all(abs(moves[name]) < _SETTLED for name in others)):
+            why = "masses or shaft of [rotor] may be wrong, or the machine is not a bearing with an overhung disc"
+            if other_zeros:
+                why = (
+                    f"its heavy spot is at angles that differ by {apart_deg:.0f}°: the zero of the shaft angle must be "
+                    "the same in all recordings, as with one pulse per revolution; or leave the angle out"
+                )
+            raise EstimationError(
+                f"{machine.title}: the rotor cannot be identified: after {number} rounds {restless} still moves; {why}"
             )
-        raise EstimationError(
-            f"{machine.title}: the rotor cannot be identified: after {_ROUNDS} rounds {restless} still moves; {why}"
-        )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance
     if sized and not has_angle(windows):
