@@ -48,6 +48,7 @@ class TdmsSource(Source):
         with readable(path, self.kind, self.package):
             from nptdms import TdmsFile  # noqa: PLC0415  # an extra
 
+            logging.getLogger("nptdms").setLevel(logging.ERROR)  # `cut` says what its warnings say
             self._file = path.open("rb")  # opened here, because the library does not close a file that it cannot read
             try:
                 self._tdms = TdmsFile.open(self._file)
@@ -58,6 +59,7 @@ class TdmsSource(Source):
         short = [channel.name for channel in channels]
         full = {f"{channel.group_name}/{channel.name}": channel for channel in channels}
         unique = {channel.name: channel for channel in channels if short.count(channel.name) == 1}
+        self.cut = self._tdms.file_status.incomplete_final_segment
         super().__init__(path, full | {name: channel for name, channel in unique.items() if name not in full})
 
     def timing(self, columns: Sequence[Reference]) -> Timing:
@@ -113,7 +115,7 @@ class TdmsSource(Source):
         try:
             yield from super().chunks(columns)
         except SourceError as error:
-            if not self._tdms.file_status.incomplete_final_segment:
+            if not self.cut:
                 raise
             raise SourceError(
                 f"{error}; the file ends within a segment: it is truncated, or still being written"

@@ -169,8 +169,8 @@ class WavSource(_Arrays):
                 file.seek(size + size % 2 - len(content), os.SEEK_CUR)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
-        """Rate from the header; WAV has no start time."""
-        return Timing(rate_hz=self._rate_hz)
+        """Rate from the header, in whole Hz; WAV has no start time."""
+        return Timing(rate_hz=self._rate_hz, rounded_hz=0.5)
 
     def unit(self, column: Reference) -> str:
         """``of full scale`` for integers, so that they are not silently taken for values in the channel's unit."""

@@ -19,7 +19,7 @@ from service.interchange.source import Array, Reference, Source, SourceError, Ti
 _MOST_RATIO = 2000
 _LATEST_NS = 9_214_646_400 * 10**9  # 2262: nanoseconds since 1970 fill 64 bits soon after
 _MOST_RATE_DIFFERENCE = 1e-4
-"""Largest relative difference of the mapping's and the file's rate: WAV rounds to whole Hz, UFF steps to six digits."""
+"""Largest relative difference of the mapping's and the file's rate: UFF rounds steps to six digits."""
 _HOUR_NS = 3_600e9
 _YEAR_NS = 31_556_952e9
 
@@ -139,12 +139,14 @@ def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | No
                 f"{source.path}: {base.rate_from} is {found[:5]}, expected one rate above 0 and at most 1e6 Hz"
             )
         told = float(found[0])
-    if told is not None and timing.rate_hz is not None and abs(told / timing.rate_hz - 1) > _MOST_RATE_DIFFERENCE:
+    if told is None or timing.rate_hz is None:
+        return timing.rate_hz if told is None else told
+    if abs(told - timing.rate_hz) > max(_MOST_RATE_DIFFERENCE * timing.rate_hz, timing.rounded_hz):
         raise SourceError(
             f"{source.path}: the file says {timing.rate_hz:.9g} samples per second, the mapping {told:.9g}; expected "
             "the same"
         )
-    return told if told is not None else timing.rate_hz
+    return told
 
 
 def _start_ns(path: Path, base: TimeBase, timing: Timing, known_ns: int | None) -> int:

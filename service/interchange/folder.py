@@ -283,4 +283,5 @@ def joined(
         read.shortest, read.longest = min(read.shortest, own.rows), max(read.longest, own.rows)
         read.filled += own.filled
         read.left_out += own.left_out
+        read.cut += own.cut
         read.gaps += [replace(gap, from_ns=gap.from_ns + offset_ns, to_ns=gap.to_ns + offset_ns) for gap in own.gaps]

@@ -7,6 +7,7 @@
                gaps)
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import floor
@@ -29,6 +30,7 @@ from service.interchange.samples import Piece, Read, check_one_rate, pieces, sig
 from service.interchange.source import Reference, SourceError
 from service.monitor.conversion import rfc3339
 
+_YEAR_NS = 31_556_952 * 10**9
 _NOTED = 0.01  # fraction of rows lost from which a note is given
 _LISTED = 10
 _NAMED = 5
@@ -175,7 +177,11 @@ def summary_lines(done: Imported) -> Iterator[str]:
         f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {rfc3339(written.start_ns)} to "
         f"{rfc3339(written.end_ns)}"
     )
+    if written.end_ns > time.time_ns() + _YEAR_NS:
+        yield 'note: these times are still to come; where a time column counts from 1970, give time.start = "unix"'
     yield from done.doubts
+    for name in read.cut:
+        yield f"note: {name} was not finished by its writer, or is truncated; what should follow is missing"
     yield from _folder_lines(done)
     yield from _gap_lines(done)
     yield from _filter_lines(done)

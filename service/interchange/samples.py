@@ -64,6 +64,7 @@ class Read:
     filled: int = 0  # rows inserted into short gaps
     # Rows left out because a cell (every cell, if channels may be missing) is empty, NaN, infinite or beyond the dtype.
     left_out: int = 0
+    cut: list[str] = field(default_factory=list)  # names of files that end before what was begun is complete
 
 
 def check_one_rate(path: Path, clock: Clock, read: Read) -> None:
@@ -116,6 +117,7 @@ def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Map
     SourceError
         If times do not ascend or a cell is no number, naming row and column.
     """
+    read.cut += [source.path.name] if source.cut else []
     splitter = _Splitter(clock, mapping, signals, read)
     columns = [signal.reference for signal in signals]
     asked = columns if clock.column is None else [clock.column, *columns]

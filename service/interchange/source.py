@@ -82,6 +82,7 @@ class Timing:
     start_ns: int | None = None  # time of the first row (or of time 0 in `time`), nanoseconds since 1970-01-01 UTC
     # Column with the time of each row, in seconds since `start_ns`, if the format defines one.
     time: Reference | None = None
+    rounded_hz: float = 0.0  # by how much the format rounds `rate_hz`
 
 
 class Source(AbstractContextManager["Source", None]):
@@ -95,6 +96,7 @@ class Source(AbstractContextManager["Source", None]):
     kind: ClassVar[str]  # name of the format
     package: ClassVar[str] = ""  # package of the extra ``io`` that reads it
     entry: ClassVar[str] = "column"  # the format's word for a column
+    cut: bool = False  # whether it ends before what its writer had begun is complete
 
     def __init__(self, path: Path, columns: Mapping[str, Any]) -> None:
         self.path = path

@@ -18,6 +18,7 @@ import scipy.sparse
 from scipy.io import savemat, wavfile
 
 from models.signals.recording import read_recording
+from service.interchange.importing import summary_lines
 from service.interchange.source import Reference, SourceError
 from service.interchange.tables import ParquetSource
 from tests.interchange.material import (
@@ -361,7 +362,9 @@ def test_the_error_for_an_unknown_format_lists_the_known_ones(tmp_path: Path) ->
         imported(tmp_path, tmp_path / "run.xyz", SAMPLED + CHANNELS)
 
 
-def test_a_tdms_file_whose_writer_was_killed_is_read(tmp_path: Path) -> None:
+def test_a_tdms_file_whose_writer_was_killed_is_read_and_noted(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     t, x, v, a = signals(1000)
     path = tmp_path / "run.tdms"
     write_tdms(path, {"t": t, "x": x, "v": v, "a": a})
@@ -369,8 +372,11 @@ def test_a_tdms_file_whose_writer_was_killed_is_read(tmp_path: Path) -> None:
     path.write_bytes(
         first[:12] + bytes(8 * [255]) + first[20 : first.index(b"TDSm", 28)]
     )  # its length is not known yet
-    (found,) = stretches(imported(tmp_path, path, CHANNELS)[1])
+    done, recording = imported(tmp_path, path, CHANNELS)
+    (found,) = stretches(recording)
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, a]))
+    assert "note: run.tdms was not finished by its writer, or is truncated" in "\n".join(summary_lines(done))
+    assert "WARNING" not in capfd.readouterr().err
 
 
 def test_measurements_that_were_appended_to_a_tdms_file_are_refused(tmp_path: Path) -> None:

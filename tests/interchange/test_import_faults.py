@@ -220,11 +220,19 @@ def test_a_contradictory_or_unusable_header_rate_is_refused(tmp_path: Path, rate
         imported(tmp_path, tmp_path / "run.wav", f'[time]\n{wish}\nstart = "{START}"\n{IN_ORDER}')
 
 
-def test_a_rate_rounded_in_the_header_is_taken_from_the_mapping(tmp_path: Path) -> None:
-    wavfile.write(tmp_path / "run.wav", 17067, np.zeros((20_000, 3), dtype=np.float32))
-    mapping = f'[time]\nrate_hz = {51200 / 3!r}\nstart = "{START}"\n{IN_ORDER}'
-    done, _ = imported(tmp_path, tmp_path / "run.wav", mapping, machine(rate_hz=51200 / 3, window={}))
-    assert done.clock.rate_hz == 51200 / 3
+@pytest.mark.parametrize("rate_hz", [51200 / 3, 1024.5])
+def test_a_rate_rounded_in_the_header_is_taken_from_the_mapping(tmp_path: Path, rate_hz: float) -> None:
+    wavfile.write(tmp_path / "run.wav", round(rate_hz), np.zeros((20_000, 3), dtype=np.float32))
+    mapping = f'[time]\nrate_hz = {rate_hz!r}\nstart = "{START}"\n{IN_ORDER}'
+    done, _ = imported(tmp_path, tmp_path / "run.wav", mapping, machine(rate_hz=rate_hz, window={}))
+    assert done.clock.rate_hz == rate_hz
+
+
+def test_times_that_are_still_to_come_are_pointed_out(tmp_path: Path) -> None:
+    assert "still to come" not in summary(tmp_path, table(tmp_path / "run.csv", GOOD), TEXT)
+    since_1970 = [f"{1767225600 + number / 2000:.6f},{row.partition(',')[2]}" for number, row in enumerate(GOOD)]
+    said = summary(tmp_path, table(tmp_path / "epoch.csv", since_1970), TEXT)
+    assert 'still to come; where a time column counts from 1970, give time.start = "unix"' in said
 
 
 def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
