@@ -322,7 +322,7 @@ def _only_levels(machine: MachineFile, text: str) -> Check:
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
     advice = "record longer, at more than one speed or load, while something besides the unbalance excites the machine"
-    if level is KnowledgeLevel.PARTIAL:
+    if level is not KnowledgeLevel.NONE:
         advice += f"; {NO_SUCH_ROTOR}"
     return Check(name="can be learned", verdict="refused", text=f"at level {level}: {text}", advice=advice)
 

@@ -120,7 +120,10 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     if not found.hops and not found.refused:
         streams = [key for key in summarize_recording(path).messages if key.endswith("/stream")]
         held = ", ".join(streams) or "no stream"
-        raise RecordingError(f"{path}: no hop of {machine.hop_data_s:g} s of {machine.title} in it; it holds {held}")
+        told = f"{path}: no hop of {machine.hop_data_s:g} s of {machine.title} in it; it holds {held}"
+        if streams and machine.keys.stream not in streams:
+            told += "; expected the site and name of such a stream in the machine file"
+        raise RecordingError(told)
     return found
 
 

@@ -149,7 +149,7 @@ def test_unusable_recordings_and_machine_files_are_refused(folder: Path) -> None
     (folder / "other.toml").write_text(NOTHING_KNOWN.replace('name = "lab"', 'name = "pump"', 1), encoding="utf-8")
     found = run(folder, "--machine", "other.toml", "--healthy", "monday.mcap", "--out", "never")
     assert found.exit_code == 2
-    assert "no hop of 5 s of demo/pump in it; it holds rotorwatch/demo/lab/stream" in found.stderr
+    assert "no hop of 5 s of demo/pump in it; it holds rotorwatch/demo/lab/stream; expected the site" in found.stderr
     (folder / "broken.toml").write_text(NOTHING_KNOWN + "\nnonsense = 1\n", encoding="utf-8")
     found = run(folder, "--machine", "broken.toml", "--healthy", "monday.mcap", "--out", "never")
     assert found.exit_code == 2
