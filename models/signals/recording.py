@@ -292,6 +292,8 @@ def reading(path: Path) -> Iterator[None]:
             why = "the file is empty, nothing was recorded in it"
         elif begins != MCAP0_MAGIC:
             why = "not a recording (MCAP); rotorwatch import makes recordings from files of other programs"
+        elif path.suffix == ".part":
+            why = f"not complete: its recorder is still writing it, or was killed{_RECOVER}"
         elif isinstance(error, EndOfFile):
             why = f"the recording is incomplete{_RECOVER}"
         else:

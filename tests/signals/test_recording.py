@@ -146,6 +146,10 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
     told = "the file is empty" if part == 0.0 else "its intact parts, if any"
     with pytest.raises(RecordingError, match=rf"cut\.mcap: .*{told}"):
         list(read_recording(cut))
+    written = "the file is empty" if part == 0.0 else "its recorder is still writing it, or was killed; rotor"
+    with pytest.raises(RecordingError, match=written):
+        list(read_recording(cut.rename(tmp_path / "cut.mcap.part")))
+    (tmp_path / "cut.mcap.part").rename(cut)
     if part < 0.01:  # not one chunk is left
         with pytest.raises(RecordingError, match=r"cut\.mcap: nothing to recover: .* no part of it is intact"):
             salvage_recording(cut, new)
