@@ -276,10 +276,13 @@ class MachineMonitor:
         self._kept_is_valid = True
         return MonitorState(self._alarms.checkpoint(), state, new, names, self.end_ns)
 
-    def restore(self, state: bytes, parts: Collection[bytes] = (), *, levels_alone: bool = False) -> None:
+    def restore(
+        self, state: bytes, parts: Collection[bytes] = (), latest: Report | None = None, *, levels_alone: bool = False
+    ) -> None:
         """Continue from the state of a monitor of the same machine, files and version; alarms are restored separately.
 
-        With `levels_alone` files and version may differ: only the levels of the first windows are restored.
+        `latest` is its latest report, shown until the next one. With `levels_alone` files and version may differ: only
+        the levels of the first windows are restored.
 
         Raises
         ------
@@ -298,7 +301,7 @@ class MachineMonitor:
         self._window.restore(unprefixed("window", arrays))
         for name, part in self._parts:
             part.restore(unprefixed(name, arrays))
-        self._test.state = test
+        self._test.state, self._latest = test, latest
         self.end_ns, self._reporter.calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
 

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 
+from pydantic import ValidationError
+
 from models.errors import CheckpointError
 from models.signals.recording import RecordedMessage
 from rotorwatch import __version__
@@ -152,7 +154,11 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
 
 
 def restored(
-    build: Callable[[], MachineMonitor], identity: Identity, checkpoint: Checkpoint, next_sequence: int
+    build: Callable[[], MachineMonitor],
+    identity: Identity,
+    checkpoint: Checkpoint,
+    next_sequence: int,
+    latest: StoredReport | None = None,
 ) -> tuple[MachineMonitor, str]:
     """Build a monitor that continues from a checkpoint, as far as that fits; say in a sentence what was restored.
 
@@ -169,8 +175,11 @@ def restored(
     }
     differs = [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]
     if not differs:
+        report = None
+        with suppress(ValidationError):  # of another form, written by an earlier state of the same version
+            report = None if latest is None else Report.model_validate_json(latest.text)
         try:
-            monitor.restore(head.state, tuple(data for _, data in checkpoint.parts))
+            monitor.restore(head.state, tuple(data for _, data in checkpoint.parts), report)
         except CheckpointError as error:
             monitor, differs = build(), [str(error)]
     try:

@@ -120,7 +120,9 @@ class MachineWorker:
             monitor = MachineMonitor(installed, self._skips)
             monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
-        monitor, text = restored(lambda: MachineMonitor(installed, self._skips), self.identity, checkpoint, last + 1)
+        report = next((one for _, one in self.history.reports(limit=1)), None)
+        build = partial(MachineMonitor, installed, self._skips)
+        monitor, text = restored(build, self.identity, checkpoint, last + 1, report)
         self.steps.kept = tuple(name for name, _ in checkpoint.parts)
         self.history.go_on_from(monitor.next_sequence - 1)
         self._time.slept(checkpoint.head.recorded_ns)

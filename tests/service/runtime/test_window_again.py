@@ -195,6 +195,8 @@ def test_after_a_clean_stop_the_window_is_kept(tmp_path: Path, kept: int) -> Non
     with restarted(tmp_path, recording=False, kept=kept, killed=False) as (here, second):
         health = second.health()
         assert (health.filled, health.restart) == (1.0, "resumed at 2026-01-01T00:00:39.000000Z")
+        assert health.report is not None  # with what it says of the machine, before the next hop
+        assert health.report.end_ns == START_NS + 37_500_000_000
         here.put(stream()[FIRST:])
         until_evaluated(second)
         assert second.health().quality.refused_blocks == {}  # the resent blocks had been requested
