@@ -31,6 +31,7 @@ from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 EARLIER_COURSES = 64  # courses that are remembered, so that repetitions of their blocks are known as such
 # The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere.
 _LATEST_NS = 7_258_118_400_000_000_000
+_LARGEST = 1e30  # sample; larger ones, as of numbers in another byte order, overflow in levels and spectra
 _MANY_S = 999_999.0
 _SURELY_S = 1.0  # a block that is next in sequence but later than this has a wrong time rather than a gap before it
 
@@ -232,14 +233,16 @@ class Gate:
         if not settings.block_from_s <= length_s <= settings.block_to_s:
             expected = f"{settings.block_from_s:g} to {settings.block_to_s:g} s"
             return self._refuse(Reason.SHAPE, f"{which} has {n_samples} samples ({length_s:g} s), expected {expected}")
-        finite = np.isfinite(block.samples)
-        if finite.all():
+        usable = np.abs(block.samples) <= _LARGEST
+        if usable.all():
             return None
-        if self._partial and finite.any():
-            finite |= ~finite.any(axis=0)
-        if not finite.all():
-            row, column = (int(where) for where in np.argwhere(~finite)[0])
-            what = f"sample {row} is {block.samples[row, column]}, expected a finite number"
+        if self._partial and usable.any():
+            usable |= ~np.isfinite(block.samples).any(axis=0)
+        if not usable.all():
+            row, column = (int(where) for where in np.argwhere(~usable)[0])
+            found = block.samples[row, column]
+            most = f" up to {_LARGEST:g}; are the bytes in little-endian order?" if np.isfinite(found) else ""
+            what = f"sample {row} is {found}, expected a finite number{most}"
             return self._refuse(Reason.NOT_FINITE, f"{which}, channel {channels[column]}: {what}")
         return None
 

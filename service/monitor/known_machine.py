@@ -320,9 +320,10 @@ class KnownMachineEvaluator(WindowEvaluator):
         off = abs(speed / operation.speed_rad_s - 1)
         if off > operation.speed_tolerance:
             text, limit = beyond(100 * off, 100 * operation.speed_tolerance)
+            falls = "; the shaft angle falls: send 2π minus the angle" if speed < 0 else ""
             raise EstimationError(
                 f"{self._machine.title}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm "
-                f"by {text} %, evaluation limit {limit} %"
+                f"by {text} %, evaluation limit {limit} %{falls}"
             )
         slowest, fastest = window.speed_range
         varied = (fastest - slowest) / operation.speed_rad_s

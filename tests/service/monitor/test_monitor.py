@@ -231,6 +231,13 @@ def test_a_run_down_raises_no_alarm() -> None:
     assert windows[-1].state is HealthState.NOT_EVALUABLE
 
 
+def test_a_shaft_angle_that_falls_is_named_with_a_remedy() -> None:
+    samples = rotor_kit.samples_of(healthy(63.0))
+    samples[:, 8] = 2 * np.pi - samples[:, 8]
+    (last,) = feed(monitor(), with_samples(healthy(63.0), samples))[0][-1:]
+    assert last.reason.endswith("evaluation limit 20 %; the shaft angle falls: send 2π minus the angle")
+
+
 # The tests of sensor checks show how each fault is found.
 @pytest.mark.parametrize("kind", ["stuck angle", "clipped"])
 def test_faulty_channels_raise_data_alarms_and_no_machine_alarm(kind: str) -> None:

@@ -66,6 +66,11 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
     "a single sample": (Reason.SHAPE, lambda feed: feed.put(feed.block(samples=feed.samples(1))), "1 samples"),
     "too long": (Reason.SHAPE, lambda feed: feed.put(feed.block(samples=feed.samples(5000))), "5000 samples (2.5 s)"),
     "NaN": (Reason.NOT_FINITE, lambda feed: feed.put(with_one(feed.block(), np.nan)), "z1_dot: sample 12 is nan"),
+    "too large": (
+        Reason.NOT_FINITE,
+        lambda feed: feed.put(with_one(feed.block(), 2.0**102)),
+        "sample 12 is 5.070602400912918e+30, expected a finite number up to 1e+30; are the bytes in little-end",
+    ),
     "infinity": (Reason.NOT_FINITE, lambda feed: feed.put(with_one(feed.block(), np.inf)), "sample 12 is inf"),
     "repeated": (Reason.OVERLAP, elsewhere(-1, -0.3), "a repetition or out of order"),
     "two versions": (Reason.CONFLICT, elsewhere(-1, -0.1), "arrived in two versions"),
