@@ -1,6 +1,6 @@
 """Examines a machine's stream as it arrives, without a monitor."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,19 +50,19 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         heard = f"; heard were {', '.join(others)}" if others else ""
         return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
     gate, missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
-    refused, rates = Counter[str](), set[float]()
+    refused, rates = defaultdict[str, list[str]](list), set[float]()
     accepted: list[SampleBlock] = []
     breaks: list[Admission] = []
     for message in stream:
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
-            refused[f"it cannot be decoded: {error}"] += 1
+            refused["malformed"].append(f"it cannot be decoded: {error}")
             continue
         rates.add(block.rate_hz)
         verdict = gate.judge(block, schema_hash)
         if not verdict.accepted:
-            refused[verdict.text] += 1
+            refused[str(verdict.reason)].append(verdict.text)
             continue
         if not verdict.continuous:
             breaks.append(verdict)
@@ -76,8 +76,8 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             "for example:"
         )
     troubles += [one.text for one in breaks[:_MOST_BREAKS]]
-    troubles += [f"{count} blocks would be refused: {text}" for text, count in refused.most_common(5)]
-    lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(refused.values())} of them usable"]
+    troubles += [f"{len(texts)} blocks would be refused, for example: {texts[0]}" for texts in refused.values()]
+    lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(map(len, refused.values()))} of them usable"]
     if rates:
         found = ", ".join(f"{rate:g}" for rate in sorted(rates))
         lines.append(f"sampling rate {found} Hz, expected {machine.rate_hz:g}")

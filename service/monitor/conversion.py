@@ -101,8 +101,9 @@ def health(  # noqa: PLR0913  # what the worker counts
     """Convert a machine's health; silence decides the state only if no alarm is raised, but is always stated."""
     since_ns = stream.silent_since_ns
     since = "the monitor started" if since_ns is None else f"{rfc3339(since_ns)[:19]}Z"
-    silence = f"no data since {since}" if stream.silent else ""
-    quality = record.quality
+    silence, quality = f"no data since {since}" if stream.silent else "", record.quality
+    if silence and quality.last_refusal and not quality.accepted_blocks:
+        silence += f", every block was refused: {quality.last_refusal}"
     if unread_messages:
         refused = quality.refused_blocks | {"unread": unread_messages}
         quality = quality.model_copy(update={"refused_blocks": refused})

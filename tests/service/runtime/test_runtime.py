@@ -123,6 +123,9 @@ def test_new_data_end_a_silence_and_refused_blocks_do_not(tmp_path: Path) -> Non
         assert worker.health().reason == "no data since the monitor started"
         assert worker.health().stream.silent_since_ns is None
         assert worker.health().stream.data_age_s is None
+        feed.put(feed.block(rate_hz=2048.0))
+        told = "no data since the monitor started, every block was refused: "
+        until(lambda: worker.health().reason.startswith(told), "refusal")
         feed.put_good()
         until(lambda: worker.health().state == "warming", "end of the silence")
         until(lambda: worker.health().state == "no-data", "silence")
@@ -130,7 +133,7 @@ def test_new_data_end_a_silence_and_refused_blocks_do_not(tmp_path: Path) -> Non
         accepted = worker.health().quality.accepted_blocks
         for _ in range(3):
             feed.put(feed.block(samples=np.full((200, 9), np.nan, dtype=np.float32)))
-        until(lambda: sum(worker.health().quality.refused_blocks.values()) == 3, "refusals")
+        until(lambda: worker.health().quality.refused_blocks == {"rate": 1, "not-finite": 3}, "refusals")
         assert (worker.health().state, worker.health().quality.accepted_blocks) == ("no-data", accepted)
 
 
