@@ -18,6 +18,7 @@ from models.errors import MachineFileError, RecordingError, WireError
 from models.levels.limits import unit_of
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
+from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor
 from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording
@@ -25,6 +26,7 @@ from models.signals.wire import decode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import MEASURES, Report
 from rotorwatch.records.levels import ChannelLevels
+from service.monitor.conversion import rfc3339
 
 _ROWS = 65536
 _MESSAGES = 1000
@@ -53,10 +55,10 @@ class Selection:
     to_ns: int | None = None
     si: bool = False  # whether samples are converted to SI units
 
-    def messages(self, key: str) -> Iterator[tuple[Path, RecordedMessage]]:
-        """Messages under a key, and the recording of each."""
+    def messages(self, *keys: str) -> Iterator[tuple[Path, RecordedMessage]]:
+        """Messages under these keys, and the recording of each."""
         for path in sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path)):
-            for message in read_recording(path, keys={key}):
+            for message in read_recording(path, keys=set(keys)):
                 yield path, message
 
     def root(self) -> str:
@@ -87,6 +89,11 @@ class Selection:
         """Whether a time is within the limits."""
         return (self.from_ns is None or time_ns >= self.from_ns) and (self.to_ns is None or time_ns < self.to_ns)
 
+    def overlaps(self, block: SampleBlock) -> bool:
+        """Whether part of a block is within the limits."""
+        begins = self.to_ns is None or block.start_ns < self.to_ns
+        return begins and (self.from_ns is None or block.end_ns > self.from_ns)
+
 
 @dataclass(slots=True)
 class Table:
@@ -107,7 +114,7 @@ def stream_table(selection: Selection) -> Table:
         If there is no stream or no descriptor, or the channels change within the recordings.
     """
     root = selection.root()
-    descriptor = _descriptor(selection, f"{root}/descriptor")
+    descriptor = _descriptor(selection, f"{root}/descriptor", f"{root}/stream")
     fields = [_field("time_ns", pa.int64(), "ns", "acquisition time since 1970-01-01 UTC")]
     factors = [channel.to_si if selection.si else 1.0 for channel in descriptor.channels]
     kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
@@ -198,22 +205,41 @@ def _field(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Fiel
     return pa.field(name, kind, metadata={"unit": unit, "description": description})
 
 
-def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
-    """The channel descriptor; all of them must be the same."""
-    found: ChannelDescriptor | None = None
+def _descriptor(selection: Selection, key: str, stream: str) -> ChannelDescriptor:
+    """The channel descriptor of the selected blocks; all of them must have the same."""
+    found: dict[str, ChannelDescriptor] = {}
     for path, message in selection.messages(key):
-        try:
-            descriptor = ChannelDescriptor.model_validate_json(message.payload)
-        except ValidationError as error:
-            told = "; ".join(text for _, text in mistakes(error, ChannelDescriptor))
-            raise RecordingError(f"{path}: the channel descriptor on {key} cannot be read: {told}") from error
-        if found is not None and descriptor != found:
-            raise RecordingError(f"{path}: the channels on {key} have changed; export each part separately")
-        found = descriptor
-    if found is None:
+        descriptor = _described(path, message)
+        found[descriptor.schema_hash] = descriptor
+    if not found:
         names = ", ".join(str(path) for path in selection.recordings)
         raise RecordingError(f"{names}: no channel descriptor on {key}, so the columns have no names and units")
-    return found
+    latest = next(iter(found.values()))
+    used: ChannelDescriptor | None = None
+    for path, message in selection.messages(key, stream) if len(found) > 1 else ():
+        if message.key == key:
+            latest = _described(path, message)
+            continue
+        with suppress(WireError):  # named when the samples are read
+            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+            own = found.get(schema_hash, latest)
+            if not selection.overlaps(block):
+                continue
+            if used is not None and own != used:
+                raise RecordingError(
+                    f"{path}: the channels on {key} have changed at {rfc3339(block.start_ns)}; export what is before "
+                    "and after that by itself, with --to-time and --from"
+                )
+            used = own
+    return used or latest
+
+
+def _described(path: Path, message: RecordedMessage) -> ChannelDescriptor:
+    try:
+        return ChannelDescriptor.model_validate_json(message.payload)
+    except ValidationError as error:
+        told = "; ".join(text for _, text in mistakes(error, ChannelDescriptor))
+        raise RecordingError(f"{path}: the channel descriptor on {message.key} cannot be read: {told}") from error
 
 
 def _stream_batches(
@@ -228,6 +254,8 @@ def _stream_batches(
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
             table.skipped.append(f"{path}: {error}")
+            continue
+        if not selection.overlaps(block):
             continue
         if (schema_hash and schema_hash != descriptor.schema_hash) or block.samples.shape[1] != len(factors):
             table.skipped.append(f"{path}: block {block.sequence} has other channels than the descriptor")

@@ -19,7 +19,7 @@ from models.signals.wire import encode_arrow, encode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
-from service.interchange.exported import Selection
+from service.interchange.exported import Selection, stream_table
 from service.interchange.exporting import ExportFormat, export
 from tests.interchange.material import START_NS, imported, stretches
 
@@ -162,14 +162,21 @@ def test_reports_and_alarms_are_exported_as_tables(tmp_path: Path) -> None:
     assert np.isnan(content["e_relative_change"]["samples"]).all()
 
 
-def test_channels_that_change_between_recordings_are_refused(tmp_path: Path) -> None:
+def test_channels_that_change_are_exported_by_themselves(tmp_path: Path) -> None:
     recording(tmp_path / "a.mcap", blocks=2)
     sensors = [channel.model_dump() for channel in LAB.sensors]
     sensors[0]["unit"] = "mil"
-    recording(tmp_path / "b.mcap", Machine.model_validate({**LAB.model_dump(), "sensors": sensors}), blocks=2)
-    with pytest.raises(RecordingError, match="the channels on rotorwatch/demo/lab/descriptor have changed"):
-        export(Selection((tmp_path / "a.mcap", tmp_path / "b.mcap")), "stream", "csv", tmp_path / "out.csv")
+    changed = Machine.model_validate({**LAB.model_dump(), "sensors": sensors})
+    recording(tmp_path / "b.mcap", changed, blocks=2, gap_after=0, lost=2)
+    both, change_ns = (tmp_path / "a.mcap", tmp_path / "b.mcap"), START_NS + 400 * STEP_NS
+    said = "the channels on rotorwatch/demo/lab/descriptor have changed at 2026-01-31T12:00:00.200000Z; export"
+    with pytest.raises(RecordingError, match=said):
+        export(Selection(both), "stream", "csv", tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
+    for part, unit in ((Selection(both, to_ns=change_ns), "um"), (Selection(both, from_ns=change_ns), "mil")):
+        table = stream_table(part)
+        assert table.schema.field(1).metadata[b"unit"] == unit.encode()
+        assert (sum(batch.num_rows for batch in table.batches), table.skipped) == (400, [])
 
 
 def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
