@@ -379,12 +379,14 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
         known = commissioned.completed(machine)
         networks = load_bundle(directory, known) if known is not None and (directory / MANIFEST).is_file() else None
         return Installed(machine, networks, commissioned)
-    if bundle is None:
+    if directory is None:
         return Installed(machine)
+    if (directory / "report.json").is_file() and not (directory / MANIFEST).is_file():
+        raise BundleError(f"{directory}: this commissioning was refused; {directory / 'report.html'} says why")
     if not isinstance(machine, Machine):
         raise BundleError(
             f"{machine.title}: {directory} is not a commissioned bundle, and its machine file does not "
             "give all parameters of the rotor, which a trained one needs; commission it from healthy recordings "
             "(rotortrain commission), or name no bundle: then its vibration levels are watched"
         )
-    return Installed(machine, load_bundle(bundle, machine))
+    return Installed(machine, load_bundle(directory, machine))

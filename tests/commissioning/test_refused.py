@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from models.commissioning.checks import (
     check_speed_range,
 )
 from models.commissioning.commission import Commissioning
+from models.commissioning.commissioned import install
 from models.commissioning.healthy import HealthyRecording
 from models.diagnosis.misfit import AlternativeTest, Goodness
 from models.diagnosis.readings import Diagnosis, UnbalanceVector, parameter_reading
@@ -28,6 +30,7 @@ from models.diagnosis.sensors.reference import Naming
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
+from models.errors import BundleError
 from models.machine import MachineFile, Operation
 from models.signals.block import FloatArray, SampleBlock
 from simulator.scenario import Event
@@ -159,6 +162,13 @@ def test_an_unfit_recording_is_refused_with_advice(make: Callable[[], Commission
     said = {one.name: f"{one.verdict}: {one.text}; {one.advice}" for one in made.report.checks}
     for check, words in told.items():
         assert re.search(words, said[check] if check else made.report.summary)
+
+
+@pytest.mark.parametrize("machine", [LAB, PARTIAL])
+def test_a_monitor_says_that_a_commissioning_was_refused(tmp_path: Path, machine: MachineFile) -> None:
+    (tmp_path / "report.json").touch()
+    with pytest.raises(BundleError, match=r"this commissioning was refused; .*report\.html says why"):
+        install(machine, tmp_path)
 
 
 @pytest.mark.parametrize(("hops", "verdict"), [(71, "passed"), (70, "limited")])
