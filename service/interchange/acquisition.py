@@ -46,9 +46,9 @@ class TdmsSource(Source):
 
     def __init__(self, path: Path) -> None:
         with readable(path, self.kind, self.package):
-            from nptdms import TdmsFile  # noqa: PLC0415  # an extra
+            from nptdms import TdmsFile, log  # noqa: PLC0415  # an extra
 
-            logging.getLogger("nptdms").setLevel(logging.ERROR)  # `cut` says what its warnings say
+            log.log_manager.set_level(logging.ERROR)  # `cut` says what its warnings say
             self._file = path.open("rb")  # opened here, because the library does not close a file that it cannot read
             try:
                 self._tdms = TdmsFile.open(self._file)
