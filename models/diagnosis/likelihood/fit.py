@@ -175,16 +175,14 @@ class LikelihoodFit:
         followed = self._followed > 0
         found = self._searched(window)
         again = self._misfits > 0 and self._misfits % _MISFITS == 0
-        # Perhaps all of them have ended at a wrong maximum; or the first one has, as the levels where following ended
-        # need not be those of any force, so that a search starts far off.
+        # Perhaps all have ended at a wrong maximum; or the first has: where following ended need be near no force.
         if (again or (followed and self._misfits == 1)) and not afresh:
             found = self._retried(window, found, self._corners, found.misfit_z or 0.0)
-        misfit_z = found.misfit_z or 0.0
-        if afresh and misfit_z > _DOUBTFUL and self._latest is not None:
+        if afresh and (found.misfit_z or 0.0) > _DOUBTFUL and self._latest is not None:
             # With the forces that it has found there may be a better maximum near the nominal rotor.
             nominal = np.concatenate([np.zeros(len(STRUCTURAL)), self._latest[1].theta[len(STRUCTURAL) :]])
-            found = self._retried(window, found, self._corners, misfit_z, nominal)
-            misfit_z = found.misfit_z or 0.0
+            found = self._retried(window, found, self._corners, found.misfit_z or 0.0, nominal)
+        misfit_z = found.misfit_z or 0.0
         if self._corners < CORNERS and (again or afresh) and misfit_z > _DOUBTFUL and (first or not found.unexplained):
             # Perhaps the noise has a colour of more than one corner.
             found = self._retried(window, found, CORNERS, min(misfit_z, MOST_MISFIT))
@@ -497,4 +495,6 @@ def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.
     f = window.frequencies_hz
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)
     passed = np.clip(f, slowest / (2 * np.pi), fastest / (2 * np.pi))
-    return np.asarray((np.abs(f - passed) <= _SYNCHRONOUS_BINS * (f[1] - f[0])) | window.line_bins)
+    # What was found in the vibration hop by hop includes what a hop does not resolve.
+    found = window.hop_speed_rad_s.size / window.duration_s if window.relative_synchronous is not None else 0.0
+    return np.asarray((np.abs(f - passed) <= _SYNCHRONOUS_BINS * max(f[1] - f[0], found)) | window.line_bins)
