@@ -34,7 +34,8 @@ def test_a_monitor_survives_hostile_messages(
     assert importlib.import_module("wire_fuzz").main() == 0, capsys.readouterr()
     found = json.loads(result.read_text(encoding="utf-8"))
     assert (found["messages"], len(found["kinds"]), found["unsendable"]) == (3000, 10, 0)
-    assert found["others"]["demo/second"]["windows"] > 5
+    second = found["others"]["demo/second"]
+    assert second["windows"] > max(5, second["accepted"] // 15)
     assert sum(found["refused"].values()) > 100
 
 
