@@ -155,7 +155,8 @@ def read_pair(
     alone = fitted(bands.w, h, variance, bias)
     across = _across(alone, _other_plane(window, pair, bands), h, variance)
     if across is not None:
-        h = h - across
+        part, widening = across
+        h, variance = h - part, variance * widening**2
         alone = fitted(bands.w, h, variance, bias)
     lead_rad_s = _lead(alone, h, variance) if lead_rad_s is None else lead_rad_s
     if lead_rad_s:
@@ -204,8 +205,10 @@ def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> C
 
 def _across(
     alone: PairReading, other: ComplexArray | None, h: ComplexArray, variance: FloatArray
-) -> ComplexArray | None:
+) -> tuple[ComplexArray, float] | None:
     """Contribution of the other plane to the transfer function; None unless it fits beyond gain, delay and lead.
+
+    With it comes the factor by which not knowing its size widens the errors of gain and delay, whichever is wider.
 
     A sensor that is mounted at an angle or sensitive across its axis shows a small part of the other plane's motion. If
     one force moves both planes, that part distorts the transfer, most at frequencies where the sensor's own plane
@@ -226,7 +229,11 @@ def _across(
     if not along[-1] ** 2 > _TOLD_APART * max(1.0, float(left @ left) / max(1, y.size - design.shape[1])):
         return None
     size = float(along[-1] / triangle[-1, -1] / lengths[-1])
-    return np.asarray(size * other, dtype=np.complex128) if abs(size) < _MOST_ACROSS else None
+    if not abs(size) < _MOST_ACROSS:
+        return None
+    fitted = design[:, [0, 1, 3]]  # gain, delay and the other plane, of length 1
+    widening = float(np.sqrt(np.diag(np.linalg.inv(fitted.T @ fitted))[:2].max()))
+    return np.asarray(size * other, dtype=np.complex128), widening
 
 
 def _lead(alone: PairReading, h: ComplexArray, variance: FloatArray) -> float:
