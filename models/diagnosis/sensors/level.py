@@ -252,7 +252,9 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]
         return
     length, angle = np.log(np.abs(vectors)), np.unwrap(np.angle(vectors), axis=0)
     angle = angle - np.median(angle, axis=1, keepdims=True)  # without a phase reference each hop has its own zero
-    level = np.log(np.maximum(window.hop_waveform.rms[:, :n], np.finfo(float).tiny))
+    # Of what fluctuates alone: with the synchronous part, it would only repeat what the vectors say.
+    fluctuation = window.hop_waveform.rms[:, :n] ** 2 - np.abs(vectors) ** 2 / 2
+    level = np.log(np.maximum(fluctuation, np.finfo(float).tiny)) / 2
     for column in range(n):
         if column in paired:
             continue
@@ -266,7 +268,8 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]
         alone = np.all(np.abs(jumps[others]) < np.maximum(_STAY_ERRORS * errors[others], abs(jumps[column]) / 4))
         quiet = np.all(np.abs(levels[others]) < np.maximum(_STAY_ERRORS * level_errors[others], abs(jumps[column]) / 4))
         straight = abs(turns[column]) < _STAY_ERRORS * turn_errors[column]
-        along = abs(levels[column] - jumps[column]) < _STAY_ERRORS * level_errors[column]
+        moved = abs(levels[column]) > _STAY_ERRORS * level_errors[column]  # or a bearing that shows at 1x alone did it
+        along = moved and abs(levels[column] - jumps[column]) < _STAY_ERRORS * level_errors[column]
         if z > MOST_ERRORS and abs(value) > LEAST_JUMP and alone and quiet and straight and along:
             state = window.states[column]
             why = "expected a change of the machine to show in more than one channel: its gain jumped"
