@@ -11,7 +11,7 @@ import scipy.signal
 
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
-from models.signals.block import FloatArray
+from models.signals.block import FloatArray, SampleArray
 from models.signals.channels import Channel, Quantity, parts_seen
 from models.signals.sensor import Sensor
 from simulator.plant import PlantSamples
@@ -137,7 +137,7 @@ class SensorBank:
             late_s = ((channel.delay_us or 0.0) - first_us) * 1e-6
             self._sensors.append(SimulatedSensor(channel, settings, rms_SI, machine.rate_hz, rng, longest_s, late_s))
 
-    def measure(self, plant: PlantSamples, first: int) -> npt.NDArray[np.float32] | FloatArray:
+    def measure(self, plant: PlantSamples, first: int) -> SampleArray:
         """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype."""
         n_samples = plant.theta_rad.size
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)

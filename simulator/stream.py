@@ -14,11 +14,10 @@ from threading import Event
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from models.machine import Machine, MachineFile
-from models.signals.block import FloatArray, SampleBlock
+from models.signals.block import SampleArray, SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_arrow, encode_block
 from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_moments
@@ -171,7 +170,7 @@ class _Simulation:
         while self._taken < first:
             self.take(min(_PIECE, first - self._taken))
 
-    def take(self, n_samples: int) -> npt.NDArray[np.float32] | FloatArray:
+    def take(self, n_samples: int) -> SampleArray:
         """Next samples of all channels."""
         self._taken += n_samples
         parts = [self._rest]
@@ -183,7 +182,7 @@ class _Simulation:
         self._rest = samples[n_samples:]
         return samples[:n_samples]
 
-    def _make(self) -> npt.NDArray[np.float32] | FloatArray:
+    def _make(self) -> SampleArray:
         first = self._made
         if self._conditions and self._conditions[0][0] == first:
             self._past.append(self._conditions.popleft())

@@ -12,11 +12,10 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 from scipy.special import fdtri
 
-from models.signals.block import FloatArray
+from models.signals.block import FloatArray, IndexArray
 
 BEYOND_RANGE, ERRORS = 1.25, 6.0
 """No limit is nearer than this many times the largest healthy level, or this many standard errors of a window."""
@@ -38,7 +37,7 @@ _Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @lru_cache(maxsize=8)
-def band_edges(n_samples: int) -> npt.NDArray[np.intp]:
+def band_edges(n_samples: int) -> IndexArray:
     """Bins of a Fourier transform at which bands begin, and the end of the last one."""
     last = int(NYQUIST_PART * (n_samples // 2))
     count = max(0, int(np.log2(max(1, last) / _FIRST_BIN) * _PER_OCTAVE))

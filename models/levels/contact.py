@@ -13,11 +13,10 @@ from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
-from models.signals.block import FloatArray
+from models.signals.block import Float32Array, FloatArray
 
 _LAGS = (0, 2, 4, 8, 16, 64, 128)
 """Samples back from which the next is predicted: the longest lags separate running speed from a line beside it."""
@@ -120,7 +119,7 @@ class LatestContact:
     """Contact statistics of the latest hops, more than a window has: a light contact takes minutes to stand out."""
 
     def __init__(self, hops: int) -> None:
-        self._hops: deque[npt.NDArray[np.float32]] = deque(maxlen=hops)  # written with every hop
+        self._hops: deque[Float32Array] = deque(maxlen=hops)  # written with every hop
         self._state = 0
 
     def take(self, hop: FloatArray, state: int) -> FloatArray:

@@ -10,11 +10,10 @@ Gaussian. A rub or a stop clips it and lowers the kurtosis; impacts, as of a loo
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from models.levels.bands import BEYOND_RANGE, LINE, OF_BIN, BandLevels, BandReference
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray
 
 _PIECES, _APART = 20, 2
 """Pieces of a hop whose levels are compared, each with the next but one: in between, ringing after an impact dies."""
@@ -37,7 +36,7 @@ def swell(rest: FloatArray) -> FloatArray:
     return np.asarray(3 * np.vecdot(levels[:, :-_APART], levels[:, _APART:]) / (_PIECES - _APART), dtype=np.float64)
 
 
-def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[np.complex128]) -> FloatArray:
+def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: ComplexArray) -> FloatArray:
     """Kurtosis of each hop, corrected for lines, shape (n_hops, n); NaN where their amplitudes are not known.
 
     Second and fourth moments about the mean, shape (n_hops, n), the latter less `swell`; amplitudes of the lines, shape
@@ -77,7 +76,7 @@ _STEPS = 2
 def fallen_by_lines(
     bands: BandLevels,
     in_bands: FloatArray,
-    orders: npt.NDArray[np.complex128],
+    orders: ComplexArray,
     speed_rad_s: float,
     healthy: BandReference | None,
     healthy_parts: Sequence[float] = (),
@@ -120,7 +119,7 @@ def fallen_by_lines(
     return np.asarray(1.5 * fallen, dtype=np.float64)
 
 
-def _holds_line(power: FloatArray, freedom: FloatArray) -> npt.NDArray[np.bool_]:
+def _holds_line(power: FloatArray, freedom: FloatArray) -> BoolArray:
     """Which columns hold the power of a line: the same in every hop, except where it begins or ends.
 
     The power of noise with `freedom` degrees of freedom in a hop has a relative scatter of √(2/freedom).

@@ -40,8 +40,8 @@ import scipy  # its sub-packages are loaded when they are first used
 from models.checkpoint import checked
 from models.levels.bands import ERRORS, NEIGHBOURHOOD, NYQUIST_PART, BandLevels, band_edges
 from models.levels.kurtosis import random_kurtosis, swell
-from models.levels.orders import ORDERS, ComplexArray, Spectrum, hann_taper, order_vectors, without_orders
-from models.signals.block import FloatArray
+from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray, SampleArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 from models.signals.waveform import Waveform
 
@@ -87,17 +87,17 @@ class LevelPlan:
         return (_HIGH_HZ, end_hz) if end_hz >= 2 * _HIGH_HZ else None
 
     @cached_property
-    def displacements(self) -> npt.NDArray[np.bool_]:
+    def displacements(self) -> BoolArray:
         """Which columns are displacements or tilts."""
         return np.isin(self.quantities, (Quantity.DISPLACEMENT, Quantity.TILT))
 
     @cached_property
-    def velocities(self) -> npt.NDArray[np.bool_]:
+    def velocities(self) -> BoolArray:
         """Which columns are velocities."""
         return np.isin(self.quantities, Quantity.VELOCITY)
 
     @cached_property
-    def accelerations(self) -> npt.NDArray[np.bool_]:
+    def accelerations(self) -> BoolArray:
         """Which columns are accelerations."""
         return np.isin(self.quantities, Quantity.ACCELERATION)
 
@@ -243,7 +243,7 @@ def hop_levels(
 @lru_cache(maxsize=8)
 def _band_cuts(
     n_samples: int, rate_hz: float, band_hz: tuple[float, float]
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+) -> tuple[IndexArray, IndexArray, IndexArray]:
     """Bins at which any band begins or ends; their indices for the edges of narrow bands, and for the velocity band."""
     edges = band_edges(n_samples)
     low, high = (round(edge_hz / (rate_hz / n_samples)) for edge_hz in band_hz)
@@ -253,7 +253,7 @@ def _band_cuts(
 
 
 def _acceleration_squares(
-    plan: LevelPlan, spectrum: Spectrum, parts: FloatArray | npt.NDArray[np.float32], band: slice, n_samples: int
+    plan: LevelPlan, spectrum: Spectrum, parts: SampleArray, band: slice, n_samples: int
 ) -> FloatArray:
     """Squares for accelerations, shape (3, n): velocity in the band, the high-frequency band, and its envelope.
 
@@ -292,7 +292,7 @@ class WindowLevels:
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
     moments: tuple[FloatArray, FloatArray, ComplexArray, FloatArray] | None = None
     contact: FloatArray | None = None  # (n_hops, n), see `models.levels.contact`
-    settled: npt.NDArray[np.bool_] | None = None  # (n_hops,), whether the shaft is known to have turned at one speed
+    settled: BoolArray | None = None  # (n_hops,), whether the shaft is known to have turned at one speed
 
     def without(self, columns: Sequence[int], pairs: Sequence[tuple[int, int]]) -> "WindowLevels":
         """Copy these levels with NaN for some channels, and for levels of the pairs of displacements they are in.
@@ -335,7 +335,7 @@ class WindowLevels:
         return None if self.moments is None else random_kurtosis(*self.moments[:3])
 
     @property
-    def hidden_twice(self) -> npt.NDArray[np.bool_] | None:
+    def hidden_twice(self) -> BoolArray | None:
         """Whether the random vibration at its present level explains the 2x, shape (n,); None if that is not known.
 
         With a phase reference that level follows from the steps of 2x between hops, otherwise from the bands around it.

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, Float32Array, FloatArray
 
 ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 """Multiples of running speed, by the name of their measure."""
@@ -17,9 +17,7 @@ _SAMPLES_A_TURN = 8.0
 _NEAR = 8
 """Samples over which a shaft's speed is taken as constant."""
 
-ComplexArray = npt.NDArray[np.complex128]
 Spectrum = npt.NDArray[np.complex64] | ComplexArray
-_SingleArray = npt.NDArray[np.float32]
 
 
 def order_vectors(
@@ -52,7 +50,7 @@ def order_vectors(
         return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     steps = (angle_rad[1::_NEAR] - angle_rad[:-1:_NEAR]) / (2 * np.pi)  # between neighbours, every `_NEAR` samples
     steps -= np.rint(steps)  # where the angle starts again from zero
-    weights: FloatArray | _SingleArray
+    weights: FloatArray | Float32Array
     if abs(np.add.reduce(steps)) * n_samples < _MANY_REVOLUTIONS * steps.size:
         # Over few revolutions the orders are nearly collinear: separating them needs double precision.
         angle, tapered, weights, every = angle_rad, x / unit[:, None], np.ones(n_samples), 1
@@ -92,7 +90,7 @@ def without_orders(x: FloatArray, vectors: ComplexArray, angle_rad: FloatArray) 
 
 
 @lru_cache(maxsize=8)
-def hann_taper(size: int) -> tuple[_SingleArray, float]:
+def hann_taper(size: int) -> tuple[Float32Array, float]:
     """Hann taper of `size` samples, and the factor that turns squared magnitudes of bins into mean squares."""
     taper = np.hanning(size + 1)[:-1].astype(np.float32)
     taper.flags.writeable = False

@@ -8,10 +8,9 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
 from models.levels.gains import place_of
-from models.levels.orders import ComplexArray
+from models.signals.block import BoolArray, ComplexArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
@@ -56,7 +55,7 @@ def rewired(vectors: ComplexArray, healthy: ComplexArray, channels: Sequence[Cha
 
 
 def _mistakes(
-    places: list[list[int]], turned: npt.NDArray[np.bool_], channels: Sequence[Channel]
+    places: list[list[int]], turned: BoolArray, channels: Sequence[Channel]
 ) -> Iterator[tuple[list[int], list[int], int]]:
     """Mistakes to test: columns that are wrong, the columns whose healthy vectors they show, and with which sign."""
     of_place = [bool(turned[place].all()) for place in places]

@@ -15,8 +15,12 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
+BoolArray = npt.NDArray[np.bool_]
+IndexArray = npt.NDArray[np.intp]
 FloatArray = npt.NDArray[np.float64]
-SampleArray = npt.NDArray[np.float32] | FloatArray
+Float32Array = npt.NDArray[np.float32]
+ComplexArray = npt.NDArray[np.complex128]
+SampleArray = Float32Array | FloatArray
 
 
 def nanoseconds(moment: datetime) -> int:

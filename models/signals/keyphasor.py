@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, FloatArray
 
 _NEIGHBOURS = 9
 _MOST_MISSING = 3
@@ -87,7 +87,7 @@ class PulseTrain:
 
     times: FloatArray  # (n,), ascending
     counts: npt.NDArray[np.int64]  # (n,), number of each pulse, with the missing ones counted
-    known: npt.NDArray[np.bool_]  # (n - 1,), whether the shaft turned without doubt from this pulse to the next
+    known: BoolArray  # (n - 1,), whether the shaft turned without doubt from this pulse to the next
     pulses_per_turn: int
     # Pulses that were missing and are bridged; pulses too many, which are left out.
     missing: int

@@ -8,13 +8,13 @@ import numpy as np
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, not_read, read_equation, window_view
-from models.diagnosis.window.moments import ComplexArray, plan_for
+from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import RotorwatchError, WireError
 from models.ingest import Gate
 from models.machine import Machine, MachineFile
-from models.signals.block import FloatArray, SampleBlock
+from models.signals.block import ComplexArray, FloatArray, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.windows import Equation as EquationReading
 from service.analysis.recorded import Recorded

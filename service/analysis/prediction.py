@@ -19,13 +19,12 @@ import numpy as np
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import SpectralModel, starting_point, usual_force
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.excitation import low_pass
 from models.physics.rotor import COORDINATES, PARAMETERS, RotorParameters, changed, system_A
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from rotorwatch.records.windows import Parameter
 
 NOTHING_READ = "no parameter was read in this window"

@@ -30,14 +30,14 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.networks.amortised import NEAR, around
-from models.diagnosis.networks.features import Float32Array, ForceFeatures, principal_directions
-from models.diagnosis.window.moments import ComplexArray, plan_for
+from models.diagnosis.networks.features import ForceFeatures, principal_directions
+from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix, changed
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, Float32Array, FloatArray
 from simulator.training.draws import Purpose
 
-_Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex128])
+_Complex = TypeVar("_Complex", npt.NDArray[np.complex64], ComplexArray)
 # Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
 # would teach the network to answer "healthy" to everything small.
 LOG_RATIO = 0.55

@@ -20,10 +20,9 @@ from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow
 from models.diagnosis.baseline.numbers import NotNegative, Positive
 from models.diagnosis.baseline.relation import Relation, change_of
 from models.diagnosis.baseline.rows import Row
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 _BAND_HZ = 8.0
 # Largest distance at which two forces count as the same. On finite-element rotors (overhung, between bearings; seeds

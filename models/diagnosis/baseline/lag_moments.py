@@ -18,9 +18,8 @@ import numpy.typing as npt
 from scipy.linalg.lapack import dpstrf
 
 from models.diagnosis.baseline.rows import Formation, Row, formation_of
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray, IndexArray
 
 _SPACING_S = 0.004  # at time scale 1
 _FALLEN_TO = 0.1
@@ -119,9 +118,9 @@ class LagMoments:
     kernels: Kernels
     values: FloatArray  # (n_moments, n_terms), one row per reference and kernel, SI units
     hop_values: FloatArray  # (n_hops, n_moments, n_terms), the same for every hop
-    index: npt.NDArray[np.intp]  # (n_moments, n_moments), positions of a covariance's elements in `of.blocks`
+    index: IndexArray  # (n_moments, n_moments), positions of a covariance's elements in `of.blocks`
 
-    def only(self, kept: npt.NDArray[np.intp]) -> "LagMoments":
+    def only(self, kept: IndexArray) -> "LagMoments":
         """Select some of the moments by index."""
         return replace(
             self, values=self.values[kept], hop_values=self.hop_values[:, kept], index=self.index[np.ix_(kept, kept)]
@@ -167,7 +166,7 @@ class RowWindow:
     # (n_pairs, n_references, n_references, 2 n_distances - 1): covariance of the moments of each pair of terms, by
     # their references and by the distance of their kernels
     blocks: FloatArray
-    pairs: npt.NDArray[np.intp]  # (2, n_pairs), the pairs of terms
+    pairs: IndexArray  # (2, n_pairs), the pairs of terms
     shape: Shape  # of the kernels
 
     def beyond(self, lag_from_s: float) -> LagMoments:
@@ -241,7 +240,7 @@ def _waves(frequencies: bytes, spacing_s: float, count: int) -> tuple[FloatArray
 
 
 @lru_cache(maxsize=64)
-def _block_index(n_references: int, n_kernels: int, n_distances: int) -> npt.NDArray[np.intp]:
+def _block_index(n_references: int, n_kernels: int, n_distances: int) -> IndexArray:
     """Positions of a covariance's elements in its flattened blocks, shape (n_moments, n_moments)."""
     middle = n_distances // 2
     k = np.arange(n_kernels)
@@ -269,7 +268,7 @@ def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: Floa
     return np.asarray(found.reshape(a.values.shape[0], b.values.shape[0]), dtype=np.float64)
 
 
-def telling(covariance: FloatArray) -> npt.NDArray[np.intp]:
+def telling(covariance: FloatArray) -> IndexArray:
     """Indices of moments with variance of their own, shape (n_kept,).
 
     Neighbouring kernels overlap. If the others account for a moment's variance to within a hundredth, the rest is not

@@ -15,10 +15,9 @@ from pydantic import Field, FiniteFloat
 
 from models.diagnosis.baseline.numbers import Covariance, Vector
 from models.diagnosis.baseline.rows import Row, lowest, state_of
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 SPEED_TOLERANCE = 0.03  # relative deviation of the speed within which synchronous vectors are compared
 _NEIGHBOURS = (2, 8)

@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.diagnosis.likelihood.following import Linearised
@@ -35,12 +34,11 @@ from models.diagnosis.likelihood.spectral_model import (
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray
 
 _COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0  # converged: no diagnosed parameter would move by more than this many standard errors
@@ -63,7 +61,7 @@ _MISFITS = 4  # windows in a row that misfit before one is searched cold as well
 _DOUBTFUL = 2.0  # misfit after a cold search from which another is made, with a noise of more corners
 _FOLLOWED = 12  # windows in a row that may reuse one window's units and slopes before a search makes new ones
 
-_Band = tuple[FloatArray, npt.NDArray[np.bool_]]
+_Band = tuple[FloatArray, BoolArray]
 """Frequencies of a window's bins, and which of them are excluded."""
 
 
@@ -390,7 +388,7 @@ class LikelihoodFit:
             self._line_band = band
         return model, search.weights, found
 
-    def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
+    def _checked_power(self, window: WindowStatistics, used: BoolArray) -> FloatArray:
         """Mean density of every state; raises EstimationError for dead or doubled channels."""
         if np.count_nonzero(used) < _FEWEST_BINS:
             raise EstimationError(
@@ -490,7 +488,7 @@ def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     return model.observed(grouped(model.machine, window, model.groups))
 
 
-def _near_lines(window: WindowStatistics, speed_rad_s: float) -> npt.NDArray[np.bool_]:
+def _near_lines(window: WindowStatistics, speed_rad_s: float) -> BoolArray:
     """Bins around the rotation, over its range of speeds, and other lines: their residue is not stochastic."""
     f = window.frequencies_hz
     slowest, fastest = window.speed_range if window.removed_by_hop else (speed_rad_s, speed_rad_s)

@@ -26,8 +26,7 @@ from models.diagnosis.likelihood.scoring import (
     whitened_at,
 )
 from models.diagnosis.likelihood.spectral_model import ROWS, Expected, ModelPoint, SpectralModel, Speeds, packed
-from models.diagnosis.window.moments import ComplexArray
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 _MOST_STEPS = 6
 _FARTHEST = 0.15  # relative change of the expected spectra (rms) beyond which the weights no longer suit them

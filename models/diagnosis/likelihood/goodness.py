@@ -12,16 +12,14 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import IDENTITY, STRUCTURAL, Sides, SpectralModel, packed, twice_packed
 from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, AlternativeTest, Goodness
 from models.diagnosis.readings import beyond
-from models.diagnosis.window.moments import ComplexArray
 from models.physics.rotor import PARAMETER_TEXT, STATE_INDEX, Q_shaft
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray
 from models.signals.channels import Channel, parts_seen, state_name
 
 # Signs for the elements of the dynamic matrix: +1 where they couple motions in y, -1 where they couple motions in z.
@@ -61,7 +59,7 @@ def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, stat
 
 def beyond_parameters(
     model: SpectralModel, weights: Weights, found: Maximum, slopes: FloatArray
-) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], FloatArray]:
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
     """What the model's parameters leave of deviations with these packed slopes, (n_deviations, n_groups, n²).
 
     These are the scores and the information on the deviations, each (n_deviations,); whether that information is more
@@ -119,13 +117,10 @@ def _of_sensors(model: SpectralModel, L_inverse: ComplexArray, coloured: Complex
     return [*names], np.concatenate([immediate, delayed])
 
 
-_Places = npt.NDArray[np.intp]
-
-
 @lru_cache(maxsize=64)
 def _tried(
     channels: tuple[Channel, ...], states: tuple[str, ...]
-) -> tuple[tuple[str, ...], int, FloatArray, _Places, _Places, _Places]:
+) -> tuple[tuple[str, ...], int, FloatArray, IndexArray, IndexArray, IndexArray]:
     """Sensor errors to test: their names, how many of them (the first ones) are not delays, and their weights.
 
     Weights are of shape (n_names, n_entries). Each entry's state, the motion it shows, and its own motion follow.

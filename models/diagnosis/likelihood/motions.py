@@ -26,13 +26,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from models.diagnosis.window.moments import ComplexArray, divided
+from models.diagnosis.window.moments import divided
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX, natural_frequencies
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray
 from models.signals.channels import ACCELERATIONS
 
 # Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
@@ -95,7 +94,7 @@ def _runs(edges: tuple[tuple[int, int], ...]) -> list[tuple[int, int, int]]:
 
 
 def group_bins(
-    frequencies_hz: FloatArray, machine: Machine, excluded: npt.NDArray[np.bool_], widest_hz: float, speeds: int = 1
+    frequencies_hz: FloatArray, machine: Machine, excluded: BoolArray, widest_hz: float, speeds: int = 1
 ) -> BinGroups:
     """Group evenly spaced bins: narrow near the machine's nominal modes, at most `widest_hz` elsewhere.
 

@@ -17,9 +17,8 @@ from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Sides, Spectr
 from models.diagnosis.likelihood.unbalance import around_rotation, parts
 from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import UnbalanceVector
-from models.diagnosis.window.moments import ComplexArray
 from models.physics.rotor import PARAMETERS
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 _Term = tuple[FloatArray, Callable[[FloatArray], ComplexArray]]
 """A matrix, shape (6, 6), and its factor at angular frequencies: a part of a change of the dynamic matrix."""

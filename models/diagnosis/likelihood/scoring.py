@@ -7,8 +7,7 @@ import numpy as np
 
 from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, Speeds, packed
-from models.diagnosis.window.moments import ComplexArray
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 # Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude).
 LOG_NOISE = float(np.log(1e-3))

@@ -26,17 +26,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import helmert
 from scipy.special import eval_legendre
 
 from models.diagnosis.likelihood.motions import BinGroups, Motions
-from models.diagnosis.window.moments import ComplexArray, through
+from models.diagnosis.window.moments import through
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix, Q_shaft
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray
 from models.signals.channels import parts_seen
 
 # Parameters that shape the spectra, in the order of the parameter vector.
@@ -76,7 +75,7 @@ class ModelPoint(Expected):
     # the node's weight
     G: ComplexArray
     receptance: ComplexArray  # (n_distinct, 6, 6), of all six degrees of freedom, SI, distinct frequencies by speed
-    place: npt.NDArray[np.intp]  # (n_groups, n_nodes), index of each node's receptance among these
+    place: IndexArray  # (n_groups, n_nodes), index of each node's receptance among these
     unit: FloatArray  # (n_groups, 1, 1, 6), the forces' units and D
 
     @property
@@ -325,7 +324,7 @@ def grouped(machine: Machine, window: WindowStatistics, groups: BinGroups) -> Co
     return groups.average(spectrum)
 
 
-def _integrated(machine: Machine, states: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+def _integrated(machine: Machine, states: tuple[str, ...]) -> BoolArray:
     """Which states are velocities that no sensor measures: integrals of accelerations."""
     measured = {state for sensor in machine.sensors for state in parts_seen(sensor)}
     return np.array([state.endswith("_dot") and state not in measured for state in states])
@@ -389,7 +388,7 @@ def twice_packed(matrices: ComplexArray) -> FloatArray:
 
 
 @lru_cache
-def _upper(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _upper(n: int) -> tuple[IndexArray, IndexArray, IndexArray]:
     """Indices of the diagonal, and rows and columns of the elements above it."""
     return np.arange(n), *np.triu_indices(n, 1)
 

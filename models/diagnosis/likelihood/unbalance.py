@@ -15,10 +15,9 @@ from scipy.special import chdtri
 from models.diagnosis.likelihood.motions import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, Expected, SpectralModel
 from models.diagnosis.readings import UnbalanceVector, foreign_rotation
-from models.diagnosis.window.moments import ComplexArray
 from models.errors import EstimationError
 from models.machine import Machine
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 # Probability that vectors of one unbalance contradict each other by chance, and the least relative error tried if so.
 _CHANCE, _LEAST_ERROR = 1e-3, 1e-3

@@ -13,12 +13,12 @@ import numpy as np
 from pydantic import BaseModel, Field
 from scipy.linalg import block_diag
 
-from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
+from models.diagnosis.networks.features import FeatureBasis, ForceFeatures
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, not_determined, parameter_reading
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, changed
-from models.signals.block import FloatArray
+from models.signals.block import Float32Array, FloatArray
 from rotorwatch.records.windows import Parameter
 
 OWN = {"28": ("k_by", "c_by"), "29": ("e",), "30": ("EI",), "31": ("k_bz", "c_bz")}  # own parameters of each equation

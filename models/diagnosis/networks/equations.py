@@ -14,12 +14,11 @@ from functools import partial
 
 import numpy as np
 
-from models.diagnosis.window.moments import ComplexArray
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.response import synchronous_response
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters, changed
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 _REFERENCES = ("y1", "y2", "z1", "z2")
 _ANGLES = np.arange(16) * (2 * np.pi / 16)

@@ -18,14 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.window.moments import ComplexArray, plan_for
+from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
 from models.physics.excitation import Source
 from models.physics.response import stochastic_covariance
 from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, Float32Array, FloatArray
 
-Float32Array = npt.NDArray[np.float32]
 _BANDS = 8
 _FLOOR = 1e-9
 _LEAST_VARIANCE = 1e-3

@@ -17,13 +17,13 @@ import torch
 
 from models.diagnosis.networks.amortised import LAYERS, LIMIT, OWN, AmortisedNetwork, AmortisedNetworks
 from models.diagnosis.networks.equations import Equation, SynchronousEquation
-from models.diagnosis.networks.features import FeatureBasis, Float32Array, fit_basis
+from models.diagnosis.networks.features import FeatureBasis, fit_basis
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Network, window_view
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
-from models.signals.block import FloatArray
+from models.signals.block import Float32Array, FloatArray
 
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25

@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray
 
 LONGEST_DELAY_S = 0.02  # longest delay searched for
 _DELAY_STEP_S = 2.5e-4
@@ -311,7 +309,7 @@ def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[
     return (rises, error * unsure), (-falls, other_error * unsure)
 
 
-def _passed_by_1x(window: WindowStatistics) -> npt.NDArray[np.bool_]:
+def _passed_by_1x(window: WindowStatistics) -> BoolArray:
     """Bands of a pair through which a changing speed takes the 1x, shape (n_bands,); none if that leaves none.
 
     The line leaks into bins beside it, whose jω is not its own: it falsifies the gain, by as much as the line is off.

@@ -10,12 +10,11 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window.motion import motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, FloatArray
 from models.signals.waveform import stacked_waveform
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
@@ -41,7 +40,7 @@ _FEWEST_DROPPED = 3  # least number of hops with drop-outs for a finding; fewer 
 _SHAFT_PART = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
 
 
-def stuck(window: WindowStatistics, naming: Naming, stood: npt.NDArray[np.bool_]) -> Iterator[SensorFault]:
+def stuck(window: WindowStatistics, naming: Naming, stood: BoolArray) -> Iterator[SensorFault]:
     """Channels that hold a value or show nothing but their quantisation, and a shaft angle that does not turn.
 
     The angle need not turn in the hops of `stood`, shape (n_hops,), in which the machine stood or was running down.

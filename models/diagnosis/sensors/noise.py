@@ -9,13 +9,12 @@ matter: the diagnosis allows for noise, and a finding would stop it needlessly.
 from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
-import numpy.typing as npt
 
 from models.diagnosis.sensors.kinematics import PairReading
 from models.diagnosis.sensors.reference import Naming, PairNoise, SensorReference, channel_noise, channel_rms, floor
 from models.diagnosis.window.excluded import MAINS_HZ
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
@@ -122,7 +121,7 @@ def _of_pairs(
         yield SensorFault(states=states, kind=FaultKind.NOISE, text=text, value=value, z=z)
 
 
-def _guilty(reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
+def _guilty(reading: PairReading, risen: BoolArray) -> int | None:
     """Column of the noisy one of two sensors, from powers that the other places do not explain; None if unclear."""
     bands, h = reading.bands, reading.transfer
     spectra = bands.spectra.copy()

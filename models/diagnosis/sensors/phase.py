@@ -12,9 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from models.diagnosis.sensors.reference import Naming, SensorReference
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 

@@ -14,11 +14,10 @@ import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
 from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair, same
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.motion import motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from models.signals.channels import Channel, state_name, unit_in_text
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault

@@ -7,19 +7,19 @@ only the phase reference is lost, the vibration stays as it was.
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
 from models.checkpoint import checked
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window.statistics import WindowStatistics
 from models.levels.measures import STANDS_RAD_S
 from models.levels.reference import QUIET
+from models.signals.block import BoolArray
 
 _SLOW = 0.5  # part of the window's highest speed from which on a hop counts as running, however quiet it is
 _STEADY = 0.15  # largest relative range of speed in a window of steady running, not of slowing down
 
 
-def runs_down(window: WindowStatistics) -> npt.NDArray[np.bool_]:
+def runs_down(window: WindowStatistics) -> BoolArray:
     """Which hops are quiet in all channels and slow (or of unknown speed) beside the others, shape (n_hops,).
 
     Hops at the end of a run-down are an example. There are none if no speed is known: the others may only seem quiet

@@ -9,12 +9,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from models.signals.sensor import Sensor
-
-_ComplexArray = npt.NDArray[np.complex128]
 
 
 class Equaliser:
@@ -26,7 +23,7 @@ class Equaliser:
         self._order = np.array([one.high_pass_order or 1 for one in sensors], dtype=np.intp)
         self._delay_s = np.array([(one.delay_us or 0.0) * 1e-6 for one in sensors])
 
-    def response(self, frequency_hz: FloatArray) -> _ComplexArray:
+    def response(self, frequency_hz: FloatArray) -> ComplexArray:
         """Complex gain of each sensor, shape (..., n); 1 where the frequency is unknown (nan) or 0.
 
         Frequencies, shape (...), are negative for a shaft angle that decreases.
@@ -37,7 +34,7 @@ class Equaliser:
         damped = np.where(self._order == 2, 1 + math.sqrt(2) * below + below**2, 1 + below)
         return np.asarray(np.where(known, np.exp(-2j * np.pi * f * self._delay_s) / damped, 1.0), dtype=np.complex128)
 
-    def missing(self, segments: _ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
+    def missing(self, segments: ComplexArray, frequencies_hz: FloatArray, lags_s: FloatArray) -> FloatArray:
         """What the sensors' responses remove from the correlations, shape (n_hops, n_lags, n, n).
 
         Add it to E{x_i(t) x_j(t + τ)} of each hop. `segments`, shape (n_hops, n_segments, n_bins, n), are Fourier

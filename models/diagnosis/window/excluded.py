@@ -17,10 +17,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from models.diagnosis.window.moments import ComplexArray
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray
 
 LOBE = 2  # a Hann window spreads a line over two bins on either side
 _BESIDE = range(LOBE + 1, LOBE + 4)  # bins away, that are the surroundings
@@ -66,7 +64,7 @@ def excluded_lines(
     speeds_rad_s: tuple[float, float],
     known: Sequence[KnownLine] | None = (),
     turning: ComplexArray | None = None,
-    alive: npt.NDArray[np.bool_] | None = None,
+    alive: BoolArray | None = None,
 ) -> tuple[ExcludedLine, ...]:
     """Lines that say nothing about the machine, in Fourier coefficients without mean and rotation.
 
@@ -134,9 +132,7 @@ def _beside_multiples(line_hz: float, slowest_hz: float, fastest_hz: float, by_h
     return bool((np.abs(line_hz - np.clip(line_hz, orders * slowest_hz, orders * fastest_hz)) >= by_hz).all())
 
 
-def _near_known(
-    frequencies_hz: FloatArray, speed_hz: float, known: Sequence[KnownLine] | None
-) -> npt.NDArray[np.bool_]:
+def _near_known(frequencies_hz: FloatArray, speed_hz: float, known: Sequence[KnownLine] | None) -> BoolArray:
     """Bins where a line of the healthy machine may be; all if this window is to say which lines it has."""
     near = np.full(frequencies_hz.size, known is None)
     for line_hz, order in known or ():
@@ -197,7 +193,7 @@ def _with_power(
 
 
 def _outstanding(
-    spectrum: ComplexArray, at: npt.NDArray[np.intp], between: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
+    spectrum: ComplexArray, at: IndexArray, between: tuple[IndexArray, IndexArray]
 ) -> tuple[FloatArray, ComplexArray]:
     """Power of the motion that stands out most in each bin, and the weights of the channels in that motion.
 
@@ -300,7 +296,7 @@ def _clear_powers(own: ComplexArray, spectrum: ComplexArray) -> FloatArray:
     return np.asarray((powers / usual).swapaxes(1, 2)[_clear(values, np.abs(axes) ** 2)], dtype=np.float64)
 
 
-def _clear(values: FloatArray, shares: FloatArray) -> npt.NDArray[np.bool_]:
+def _clear(values: FloatArray, shares: FloatArray) -> BoolArray:
     """Which motions stand out of the sensors' noise, whose level does not follow the load, shape (n_blocks, n).
 
     `values` are the powers of the motions, and `shares`, (n_blocks, n, n), those of each channel in them. A channel's

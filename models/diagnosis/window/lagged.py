@@ -1,13 +1,12 @@
 """Sums of products of samples with earlier ones, from which correlation functions are made."""
 
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import next_fast_len
 
-from models.signals.block import FloatArray
+from models.signals.block import FloatArray, IndexArray
 
 
-def lagged_products(a: FloatArray, lags: npt.NDArray[np.intp], before: int) -> FloatArray:
+def lagged_products(a: FloatArray, lags: IndexArray, before: int) -> FloatArray:
     """Sums ``[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the samples after the history, shape (n_lags, n, n).
 
     `a` has shape (n, before + n_samples): the first `before` samples, the history, are references only. The lags begin

@@ -23,9 +23,9 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.diagnosis.window.excluded import FEWEST_SEGMENTS, LINE_TOLERANCE, LOBE, KnownLine, phases_of
-from models.diagnosis.window.moments import ComplexArray, HopMoments, Plan
+from models.diagnosis.window.moments import HopMoments, Plan
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 _MOST_SPREAD = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between with little data
 _MOST_FAINT_SPREAD = 1.8

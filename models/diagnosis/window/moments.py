@@ -32,12 +32,10 @@ from models.levels.contact import contact
 from models.levels.measures import CONTACT, HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray, SampleArray
 from models.signals.channels import ACCELERATIONS, parts_seen, state_name
 from models.signals.keyphasor import jump_within_a_turn
 from models.signals.waveform import Waveform, waveform_of
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +48,7 @@ class Plan:
     states: tuple[str, ...]
     # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, which have
     # levels only.
-    columns: npt.NDArray[np.intp]
+    columns: IndexArray
     scales: FloatArray
     # Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
     # likely line near it.
@@ -59,8 +57,8 @@ class Plan:
     hop: int
     preamble: int
     segment: int
-    lags: npt.NDArray[np.intp]  # lags of the correlation functions, samples
-    bins: npt.NDArray[np.intp]  # frequency bins of a segment's Fourier transform that are kept
+    lags: IndexArray  # lags of the correlation functions, samples
+    bins: IndexArray  # frequency bins of a segment's Fourier transform that are kept
     # Samples from the start of a hop to that of the next: more than a hop has if there is silence between snapshots.
     stride: int
     hops: int  # hops in a full window
@@ -128,7 +126,7 @@ class Plan:
         factors = np.where(np.array(self.mounted) == sensor, factor, 1.0)
         return np.asarray((turn * factors) @ np.linalg.inv(turn), dtype=np.float64)
 
-    def motions(self, alive: npt.NDArray[np.bool_]) -> list[int]:
+    def motions(self, alive: BoolArray) -> list[int]:
         """Columns of sensors that are alive, one for each motion."""
         twice = {pair.second for pair in self.pairs if alive[pair.first]}
         return [column for column in np.flatnonzero(alive).tolist() if column not in twice]
@@ -138,7 +136,7 @@ class Plan:
         """Columns that measure the same motion."""
         return motion_pairs(self.mounted)
 
-    def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
+    def to_si(self, samples: SampleArray) -> FloatArray:
         """Sensors as mounted, and other channels, in SI units and, last, the shaft angle if there is one.
 
         The shape is (n_samples, width), with each channel's samples contiguous in memory.
@@ -363,7 +361,7 @@ class Rotation:
     source: SpeedSource
     hop_speed_rad_s: FloatArray  # (n_hops,), nan where unknown
     by_hop: bool  # whether every hop has its own coefficients
-    settled: npt.NDArray[np.bool_]  # (n_hops,), whether it had one speed in each, see `settled_hops`
+    settled: BoolArray  # (n_hops,), whether it had one speed in each, see `settled_hops`
 
 
 def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:

@@ -10,12 +10,10 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray, IndexArray
 
 N_BANDS = 24  # bands in which the powers of a hop are kept
-_ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +46,14 @@ def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:
 
 
 @lru_cache(maxsize=64)
-def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
+def pair_bands(n_bins: int) -> IndexArray:
     """First bin of each band; shape (n_bands,)."""
     edges = np.unique(np.linspace(0, n_bins, min(N_BANDS, n_bins), endpoint=False).astype(np.intp))
     edges.flags.writeable = False
     return edges
 
 
-def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:
+def pair_powers(segments: ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> ComplexArray:
     """Sum powers of Fourier coefficients, shape (n_segments, n_bins, n), over segments and the bins of each band.
 
     With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|², shape (n_pairs, n_bands, 3).

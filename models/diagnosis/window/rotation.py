@@ -13,13 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 from numpy.polynomial import Polynomial
 
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray
 
-_ComplexArray = npt.NDArray[np.complex128]
 _MARGIN_HZ = 1.0
 _SURROUNDINGS_HZ = 3.0
 _SWEEP_PER_S = 0.005  # fastest sweep searched for, as a part of the expected speed per second
@@ -121,7 +119,7 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
 
 
 def _climb(
-    y: _ComplexArray, t_s: FloatArray, base_hz: float, at_hz: float, sweep: float, step_hz: float, step_sweep: float
+    y: ComplexArray, t_s: FloatArray, base_hz: float, at_hz: float, sweep: float, step_hz: float, step_sweep: float
 ) -> tuple[float, float]:
     """One step towards the largest power: the top of a parabola through three points, in frequency, then in sweep."""
 
@@ -135,14 +133,14 @@ def _climb(
 
 
 def _swinging(
-    line: RotationLine, y: _ComplexArray, t_s: FloatArray, base_hz: float, grid_hz: FloatArray, most_hz: float
+    line: RotationLine, y: ComplexArray, t_s: FloatArray, base_hz: float, grid_hz: FloatArray, most_hz: float
 ) -> RotationLine:
     """The line with a speed that swings within the hop, if that recovers power; else as it was."""
 
-    def seen(angle: FloatArray) -> _ComplexArray:
+    def seen(angle: FloatArray) -> ComplexArray:
         return np.asarray(y * np.exp(1j * (2 * np.pi * base_hz * t_s - angle))[:, None], dtype=np.complex128)
 
-    def power_and_lost(turned: _ComplexArray) -> tuple[float, float]:
+    def power_and_lost(turned: ComplexArray) -> tuple[float, float]:
         """Power of the line in the hop, and by which part its power in parts of the hop is larger."""
         mean = turned.mean(axis=0)
         power = float(np.sum(np.abs(mean) ** 2))
@@ -181,7 +179,7 @@ def _swinging(
 
 
 def _refined(
-    seen: Callable[[FloatArray], _ComplexArray], angle: FloatArray, swings: float, strength: float
+    seen: Callable[[FloatArray], ComplexArray], angle: FloatArray, swings: float, strength: float
 ) -> FloatArray:
     """An angle that is nearly right, moved to the largest power.
 
@@ -246,7 +244,7 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     return np.where(followed, speed, np.nan) if followed.mean() >= _HELD_PART else None
 
 
-def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
+def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, hop_s: float) -> BoolArray:
     """Which hops had one speed from beginning to end; all if the lines do not stand out enough to tell.
 
     A part of a hop next to one with another speed may already have had that speed. A line that is weaker at the same
@@ -275,7 +273,7 @@ def _largest_step(speed: FloatArray, hop_s: float) -> FloatArray:
     return np.asarray(np.maximum(_MOST_SPEED_STEP * speed, _RESOLVED * 2 * np.pi / hop_s), dtype=np.float64)
 
 
-def _goes_on(lines: tuple[RotationLine | None, ...], near: FloatArray, hop_s: float) -> npt.NDArray[np.bool_]:
+def _goes_on(lines: tuple[RotationLine | None, ...], near: FloatArray, hop_s: float) -> BoolArray:
     """Whether a hop begins with the speed at which the one before ends, to within `near`, shape (n_hops,)."""
     unknown, ends = (np.nan, np.nan, 0.0), np.array([-hop_s, hop_s]) / 2
     seen = [unknown if line is None else (*line.speed(ends), len(line.swing)) for line in lines]
@@ -284,13 +282,13 @@ def _goes_on(lines: tuple[RotationLine | None, ...], near: FloatArray, hop_s: fl
     return np.asarray(np.abs(first[1:] - last[:-1]) < least, dtype=np.bool_)
 
 
-def _speed_trend(speed: FloatArray, number: npt.NDArray[np.intp]) -> FloatArray:
+def _speed_trend(speed: FloatArray, number: IndexArray) -> FloatArray:
     """Robust straight line through the speeds of the hops `number`, evaluated at every hop."""
     slope, start = scipy.stats.theilslopes(speed[number], number)[:2]
     return np.asarray(start + slope * np.arange(speed.size), dtype=np.float64)
 
 
-def relative_vectors(vectors: _ComplexArray) -> _ComplexArray:
+def relative_vectors(vectors: ComplexArray) -> ComplexArray:
     """Turn each hop's vectors, shape (n_hops, n), so that the channel with the clearest line is at angle zero.
 
     That is the channel whose relative amplitude varies least from hop to hop.

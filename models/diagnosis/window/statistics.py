@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from models.diagnosis.window.equaliser import Equaliser
 from models.diagnosis.window.excluded import (
@@ -18,7 +17,6 @@ from models.diagnosis.window.excluded import (
     summed,
 )
 from models.diagnosis.window.moments import (
-    ComplexArray,
     HopMoments,
     Plan,
     Rotation,
@@ -34,7 +32,7 @@ from models.diagnosis.window.moments import (
 from models.diagnosis.window.motion import pair_bands
 from models.diagnosis.window.rotation import relative_vectors
 from models.levels.measures import WindowLevels, window_levels
-from models.signals.block import FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # drift of a channel's mean, over its rms, above which every hop's own mean is removed
@@ -75,7 +73,7 @@ class WindowStatistics:
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
     # (n_hops,), how far the most likely rotation stands out in each (`RotationLine.strength`); nan with an angle
     hop_strength: FloatArray
-    settled: npt.NDArray[np.bool_]  # (n_hops,), whether each had one speed that was taken out, see `settled_hops`
+    settled: BoolArray  # (n_hops,), whether each had one speed that was taken out, see `settled_hops`
     hop_jump_rad: FloatArray  # (n_hops,), jump of the shaft angle in each (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     # (n_bins, n): squared coherence of each bin with the angle or, where the rotation was taken out hop by hop, with
@@ -134,7 +132,7 @@ class WindowStatistics:
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
 
     @cached_property
-    def line_bins(self) -> npt.NDArray[np.bool_]:
+    def line_bins(self) -> BoolArray:
         """Bins in which `lines` are seen, shape (n_bins,)."""
         away = [np.abs(self.frequencies_hz - line.frequency_hz) <= line.reach_hz for line in self.lines]
         return np.logical_or.reduce(away, axis=0) if away else np.zeros(self.frequencies_hz.size, dtype=np.bool_)

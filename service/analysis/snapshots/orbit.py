@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATES, RotorParameters, changed
-from models.signals.block import SampleBlock
+from models.signals.block import ComplexArray, SampleBlock
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of

@@ -6,9 +6,8 @@ from typing import TypeVar
 import numpy as np
 from scipy.special import chdtri
 
-from models.diagnosis.window.moments import ComplexArray
 from models.machine import MachineFile
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import (
     ChannelDensity,

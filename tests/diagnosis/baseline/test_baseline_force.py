@@ -18,9 +18,8 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.verdict.isolation import isolate_window
-from models.diagnosis.window.moments import ComplexArray
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from tests.diagnosis.baseline.fe_rotor import Excitation, recorded, windows_under
 from tests.sure import sure
 

@@ -14,12 +14,12 @@ from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Mot
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, CORNERS, ROWS, STRUCTURAL, SpectralModel, Speeds, packed
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.window.moments import ComplexArray, plan_for
+from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed, natural_frequencies
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from models.signals.channels import parts_seen, with_channel_names
 from simulator.scenario import Event, Scenario, load_scenario
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario, simulate_window

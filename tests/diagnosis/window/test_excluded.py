@@ -13,8 +13,7 @@ from models.diagnosis.window.excluded import (
     segment_levels,
     summed,
 )
-from models.diagnosis.window.moments import ComplexArray
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from tests.sure import sure
 
 BINS, SEGMENTS = 736, 24
