@@ -13,7 +13,7 @@ import scipy.linalg
 from models.errors import EstimationError
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 
 
 def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -59,13 +59,17 @@ def stochastic_covariance(rotor: RotorParameters, speed_rad_s: float, sources: t
     return stationary_covariance(A, B)[:12, :12]
 
 
-def synchronous_response(rotor: RotorParameters, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
-    """Amplitudes q1, q2 of x_n(t) = q1 cos Ωt + q2 sin Ωt (Eq. 17), shape (12,) each."""
+def balance(rotor: RotorParameters, speed_rad_s: float) -> tuple[ComplexArray, ComplexArray]:
+    """Dynamic stiffness, shape (6, 6), and force of the unbalance, shape (6,), at a speed, both of Re{… e^{jΩt}}."""
     W = speed_rad_s
     dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
-    H = H_matrix(rotor, W)
-    xi = np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # force = Re{(h1 - j h2) e^{jΩt}}
-    x = np.concatenate([xi, 1j * W * xi])
+    return np.asarray(dynamic, dtype=np.complex128), H_matrix(rotor, W) @ np.array([1.0, -1.0j])
+
+
+def synchronous_response(rotor: RotorParameters, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
+    """Amplitudes q1, q2 of x_n(t) = q1 cos Ωt + q2 sin Ωt (Eq. 17), shape (12,) each."""
+    xi = np.linalg.solve(*balance(rotor, speed_rad_s))
+    x = np.concatenate([xi, 1j * speed_rad_s * xi])
     return x.real.copy(), -x.imag
 
 

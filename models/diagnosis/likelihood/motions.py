@@ -297,16 +297,12 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
     at_speed = (
         np.where(made, 1 / (1j * window.speed_rad_s), 1.0) if np.isfinite(window.speed_rad_s) else np.ones(made.size)
     )
-    synchronous, by_hop, relative = window.synchronous, window.hop_synchronous, window.relative_synchronous
     hops = window.hop_correlation.shape[0]
     return replace(
-        window,
+        window.with_vectors(lambda vectors: np.asarray(vectors * at_speed, dtype=np.complex128)),
         states=tuple(velocity[name] for name in window.states),
         lags_s=window.lags_s[:1],
         correlation=correlation,
         hop_correlation=np.repeat(correlation[np.newaxis], hops, axis=0),
         spectrum=spectrum,
-        synchronous=None if synchronous is None else synchronous * at_speed,
-        hop_synchronous=None if by_hop is None else by_hop * at_speed,
-        relative_synchronous=None if relative is None else relative * at_speed,
     )

@@ -16,8 +16,8 @@ import numpy as np
 
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.response import synchronous_response
-from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters, changed
+from models.physics.response import balance, synchronous_response
+from models.physics.rotor import RotorParameters, changed
 from models.signals.block import ComplexArray, FloatArray
 
 _REFERENCES = ("y1", "y2", "z1", "z2")
@@ -174,7 +174,7 @@ class SynchronousEquation:
         rotor, speed = machine.rotor, machine.operation.speed_rad_s
         q1, q2 = synchronous_response(changed(rotor, {"EI": _STEP}), speed)
         moved = (q1 - 1j * q2)[: len(q1) // 2]
-        dynamic, force = _balance(rotor, speed)
+        dynamic, force = balance(rotor, speed)
         foreign = np.linalg.solve(dynamic[np.ix_(_DISC, _DISC)], (dynamic @ moved - force)[_DISC])
         mean = float((foreign[0] + 1j * foreign[2]).real) / 2  # Y2 and jZ2, as in the rows
         return {"EI": mean / _STEP / _disc_response_to_e(rotor, speed)}
@@ -183,16 +183,9 @@ class SynchronousEquation:
 _DISC, _STEP = [1, 2, 4, 5], 0.01
 
 
-def _balance(rotor: RotorParameters, speed_rad_s: float) -> tuple[ComplexArray, ComplexArray]:
-    """Dynamic stiffness, shape (6, 6), and force of the nominal unbalance, shape (6,), at a speed."""
-    W = speed_rad_s
-    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
-    return np.asarray(dynamic, dtype=np.complex128), H_matrix(rotor, W) @ np.array([1.0, -1.0j])
-
-
 def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:
     """Derivative of Y2 with respect to the relative change of e for given bearing motion, m (real by symmetry)."""
-    dynamic, force = _balance(rotor, speed_rad_s)
+    dynamic, force = balance(rotor, speed_rad_s)
     return float(np.linalg.solve(dynamic[np.ix_(_DISC, _DISC)], force[_DISC])[0].real)
 
 

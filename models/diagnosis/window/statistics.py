@@ -1,6 +1,6 @@
 """Statistics of a window, from the moments of its hops."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -104,16 +104,12 @@ class WindowStatistics:
         if states == self.states:
             return self
         kept = [self.states.index(state) for state in states]
-        synchronous, by_hop, relative = self.synchronous, self.hop_synchronous, self.relative_synchronous
         return replace(
-            self,
+            self.with_vectors(lambda vectors: vectors[..., kept]),
             states=states,
             correlation=self.correlation[..., kept, :][..., kept],
             hop_correlation=self.hop_correlation[..., kept, :][..., kept],
             spectrum=self.spectrum[:, kept][:, :, kept],
-            synchronous=None if synchronous is None else synchronous[kept],
-            hop_synchronous=None if by_hop is None else by_hop[:, kept],
-            relative_synchronous=None if relative is None else relative[:, kept],
             phase_kept=None if self.phase_kept is None else self.phase_kept[:, kept],
             waveforms=(),
             sensors=(),
@@ -121,6 +117,12 @@ class WindowStatistics:
             mounted=None,
             lines=tuple(line.turned(np.eye(len(self.states))[kept]) for line in self.lines),
         )
+
+    def with_vectors(self, change: Callable[[ComplexArray], ComplexArray]) -> "WindowStatistics":
+        """The same window with its rotation-synchronous vectors, shape (…, n), changed."""
+        vectors = (self.synchronous, self.hop_synchronous, self.relative_synchronous)
+        synchronous, by_hop, relative = (None if one is None else change(one) for one in vectors)
+        return replace(self, synchronous=synchronous, hop_synchronous=by_hop, relative_synchronous=relative)
 
     def turned(self, turn: FloatArray) -> "WindowStatistics":
         """The same window with its states multiplied by a matrix, shape (n, n); sensors as mounted stay as they are."""
@@ -364,19 +366,14 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
 
 def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray) -> WindowStatistics:
     """Statistics of the states, from those of sensors at an angle: every moment is multiplied from both sides."""
-
-    def vectors(mounted: ComplexArray | None) -> ComplexArray | None:
-        return None if mounted is None else np.asarray(mounted @ turn.T, dtype=np.complex128)
-
-    relative = vectors(window.relative_synchronous)
+    found = window.with_vectors(lambda mounted: np.asarray(mounted @ turn.T, dtype=np.complex128))
+    relative = found.relative_synchronous
     return replace(
-        window,
+        found,
         states=states,
         correlation=turn @ window.correlation @ turn.T,
         hop_correlation=turn @ window.hop_correlation @ turn.T,
         spectrum=turn @ window.spectrum @ turn.T,
-        synchronous=vectors(window.synchronous),
-        hop_synchronous=vectors(window.hop_synchronous),
         relative_synchronous=None if relative is None else relative_vectors(relative),
         lines=tuple(line.turned(turn) for line in window.lines),
         mounted=window.as_mounted,
