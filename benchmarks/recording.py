@@ -21,8 +21,13 @@ import numpy as np
 
 from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
-from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
-from models.signals.salvage import salvage_recording
+from models.signals.recording import (
+    RecordedMessage,
+    RecordingWriter,
+    read_recording,
+    salvage_recording,
+    summarize_recording,
+)
 from models.signals.wire import encode_block
 from service.recordings.recorder import MachineRecorder
 from service.settings.service import LogSettings, RecordingSettings

@@ -21,9 +21,8 @@ from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
 from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters, natural_frequencies
-from models.signals.channels import Channel, ChannelDescriptor, Quantity, state_name
+from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor, state_name
 from models.signals.keys import MachineKeys
-from models.signals.sensor import Sensor
 from models.stream_settings import IngestSettings, Schedule, WindowSettings, default_window, time_scale, whole
 
 SHIPPED_MACHINES = Path(__file__).parent / "machines"

@@ -12,8 +12,7 @@ import scipy.signal
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray, SampleArray
-from models.signals.channels import Channel, Quantity, parts_seen
-from models.signals.sensor import Sensor
+from models.signals.channels import Channel, Quantity, Sensor, parts_seen
 from simulator.plant import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
 from simulator.timeline import SWAPPED_WITH, SensorFaults

@@ -41,8 +41,8 @@ from models.diagnosis.window.excluded import KnownLine
 from models.diagnosis.window.moments import states_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
-from models.levels.gains import learn_gains, place_of
 from models.levels.limits import GrowthToAlert, alerts_of
+from models.levels.places import learn_gains, place_of
 from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS

@@ -14,7 +14,6 @@ import numpy as np
 
 from models.levels.bands import ERRORS, Growth, band_in_words, growth
 from models.levels.contact import LatestContact
-from models.levels.gains import left_of_1x, place_of, wrong_gain
 from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
 from models.levels.limits import (
     MEASURE_WORDS,
@@ -31,9 +30,9 @@ from models.levels.limits import (
 )
 from models.levels.lines import new_line
 from models.levels.measures import LevelPlan, WindowLevels
+from models.levels.places import left_of_1x, place_of, rewired, wrong_gain
 from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import ZONES, LevelSettings, zone_of
-from models.levels.wiring import rewired
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, unit_in_text
 from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits

@@ -11,10 +11,10 @@ from pydantic import BaseModel, Field, model_validator
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
 from models.levels.bands import NEIGHBOURHOOD, BandLevels, BandReference, learn_bands
-from models.levels.gains import GainReference
 from models.levels.kurtosis import HopReference, learn_hops
 from models.levels.lines import expected_lines, learn_lines
 from models.levels.measures import COMPARED, WindowLevels
+from models.levels.places import GainReference
 from models.signals.block import FloatArray
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -62,7 +62,7 @@ class LevelReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
     source: str  # where they are from, as operators will read it
     states: tuple[OperatingState, ...] = Field(min_length=1)
-    # Levels of the places for comparison with each other, see `models.levels.gains`.
+    # Levels of the places for comparison with each other, see `models.levels.places`.
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
     # Frequency, Hz, and order of each line; None if lines were not looked for.
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)

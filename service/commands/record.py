@@ -191,7 +191,7 @@ def _summed_up(recorders: "list[MachineRecorder]") -> bool:
 
 
 def _recover(file: Path, out: Path | None) -> None:
-    from models.signals.salvage import inspect_recording, salvage_recording  # noqa: PLC0415  # keeps --help quick
+    from models.signals.recording import inspect_recording, salvage_recording  # noqa: PLC0415  # keeps --help quick
     from service.recordings.catalogue import PART  # noqa: PLC0415
     from service.recordings.leftovers import is_locked, loss_text  # noqa: PLC0415
 

@@ -15,8 +15,7 @@ from models.errors import MachineFileError
 from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.block import nanoseconds
-from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
-from models.signals.sensor import Sensor
+from models.signals.channels import Channel, Quantity, Sensor, time_unit_ns, unit_factor
 from service.interchange.source import Format, Source, SourceError
 
 _DATETIME = "datetime"

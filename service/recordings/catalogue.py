@@ -26,8 +26,7 @@ from pydantic import Field
 
 from models.errors import RecordingError
 from models.signals.keys import NAME_PATTERN
-from models.signals.recording import RecordedMessage, read_recording, summarize_recording, writing
-from models.signals.salvage import salvaged_messages
+from models.signals.recording import RecordedMessage, read_recording, salvaged_messages, summarize_recording, writing
 from models.signals.wire import REPLAY_MARK
 from rotorwatch.records.recordings import RecordingEntry
 from service.history.records import StoredEvent

@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 from models.errors import RecordingError
-from models.signals.recording import writing
-from models.signals.salvage import Salvage, salvage_recording
+from models.signals.recording import Salvage, salvage_recording, writing
 from service.recordings.catalogue import PART, SUFFIX
 
 DAMAGED = ".damaged"

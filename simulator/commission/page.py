@@ -18,8 +18,16 @@ from models.errors import RecordingError
 from models.machine import MachineFile
 from models.signals.channels import unit_in_text
 from simulator.commission import verdict
-from simulator.commission.plots import draw_budget, draw_readings, inline_svg
-from simulator.commission.recording_plots import Portrait, draw_levels, draw_spectra, ordered, portrait
+from simulator.commission.plots import (
+    Portrait,
+    draw_budget,
+    draw_levels,
+    draw_readings,
+    draw_spectra,
+    inline_svg,
+    ordered,
+    portrait,
+)
 
 _COMPARED = {
     KnowledgeLevel.FULL: "Each healthy window against the parameters in the machine file.",

@@ -19,7 +19,7 @@ from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.response import stochastic_covariance, synchronous_response
 from models.physics.rotor import PARAMETERS, STATE_INDEX, changed
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 

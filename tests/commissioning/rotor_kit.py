@@ -12,7 +12,7 @@ from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
 from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 

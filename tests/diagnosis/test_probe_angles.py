@@ -18,8 +18,7 @@ from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import SampleBlock
-from models.signals.channels import ChannelDescriptor, state_name, with_channel_names
-from models.signals.sensor import Sensor
+from models.signals.channels import ChannelDescriptor, Sensor, state_name, with_channel_names
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import mounted

@@ -10,9 +10,9 @@ from scipy.signal import lfilter
 
 from models.levels.bands import BandLevels
 from models.levels.contact import LatestContact
-from models.levels.gains import GainReference, learn_gains, left_of_1x, wrong_gain
 from models.levels.judgement import LevelJudge
 from models.levels.measures import WindowLevels, level_plan
+from models.levels.places import GainReference, learn_gains, left_of_1x, wrong_gain
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.channels import Channel

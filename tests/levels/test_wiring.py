@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from models.levels.wiring import rewired
+from models.levels.places import rewired
 from models.signals.channels import Channel
 from tests.sure import sure
 

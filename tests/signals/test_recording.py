@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from models.errors import RecordingError
-from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
-from models.signals.salvage import inspect_recording, salvage_recording
+from models.signals.recording import (
+    RecordedMessage,
+    RecordingWriter,
+    inspect_recording,
+    read_recording,
+    salvage_recording,
+    summarize_recording,
+)
 from tests.sure import sure
 
 messages = st.builds(

@@ -7,7 +7,7 @@ import pytest
 from models.machine import Machine, load_machine
 from models.physics.rotor import STATES
 from models.signals.block import FloatArray
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 from simulator.plant import PlantSamples
 from simulator.scenario import ChannelSettings, Sensors, SensorSettings
 from simulator.sensors import SensorBank, SimulatedSensor

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from models.signals.block import ComplexArray, FloatArray
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 
 
 class Equaliser:

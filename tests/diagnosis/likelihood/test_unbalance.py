@@ -14,8 +14,7 @@ from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
-from models.signals.channels import Quantity
-from models.signals.sensor import Sensor
+from models.signals.channels import Quantity, Sensor
 from rotorwatch.records.windows import Parameter
 from simulator.scenario import Event
 from simulator.stream import blocks

@@ -14,7 +14,7 @@ from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.window.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import FloatArray, SampleBlock
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report

@@ -14,7 +14,7 @@ from models.ingest import Reason
 from models.levels.settings import LevelLimit
 from models.machine import AlarmSettings
 from models.signals.block import SampleBlock
-from models.signals.sensor import Sensor
+from models.signals.channels import Sensor
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
 from rotorwatch.records.levels import ChannelLevels

@@ -14,8 +14,14 @@ import pytest
 import zenoh
 
 from models.signals.link import LinkSettings
-from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
-from models.signals.salvage import inspect_recording, salvage_recording
+from models.signals.recording import (
+    RecordedMessage,
+    RecordingWriter,
+    inspect_recording,
+    read_recording,
+    salvage_recording,
+    summarize_recording,
+)
 from models.signals.wire import encode_block
 from service.recordings.catalogue import Catalogue
 from service.recordings.leftovers import is_locked

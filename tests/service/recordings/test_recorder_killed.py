@@ -12,8 +12,13 @@ import pytest
 import zenoh
 
 from models.signals.link import LinkSettings
-from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
-from models.signals.salvage import inspect_recording, salvage_recording
+from models.signals.recording import (
+    RecordedMessage,
+    RecordingWriter,
+    inspect_recording,
+    read_recording,
+    salvage_recording,
+)
 from service.recordings.leftovers import DAMAGED
 from tests.loopback import session_of
 from tests.service.rig.live import LAB, Program, endpoint, program, until

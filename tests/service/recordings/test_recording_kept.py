@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
-from models.signals.salvage import salvaged_messages
+from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, salvaged_messages
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from service.history.records import StoredEvent, StoreError
