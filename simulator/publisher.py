@@ -93,7 +93,10 @@ def publish(
         summary = _send(outlets, probe, machine, stream if settings.pace else held(), settings, stop, on_block)
         if settings.pace is None and not stop.is_set():
             wait_for_subscriber()
-            _drain(session, machine.keys, settings.drain_s)
+            # Wait until the monitor has received everything: a query of lower priority leaves after all blocks, and the
+            # monitor's side handles one link in order. Without a monitor there is no answer and no waiting.
+            for _ in session.get(machine.keys.health, priority=zenoh.Priority.DATA_LOW, timeout=settings.drain_s):
+                pass
         probe.undeclare()  # type: ignore[no-untyped-call]
         stop.wait(settings.linger_s)
         return summary
@@ -216,13 +219,3 @@ def _send(
         if on_block is not None:
             on_block(summary)
     return summary
-
-
-def _drain(session: zenoh.Session, keys: MachineKeys, timeout_s: float) -> None:
-    """Wait until the monitor has received everything sent so far.
-
-    A query of lower priority leaves after all blocks, and the monitor's side handles one link in order: its answer says
-    that the blocks have arrived. Without a monitor there is no answer and no waiting.
-    """
-    for _ in session.get(keys.health, priority=zenoh.Priority.DATA_LOW, timeout=timeout_s):
-        pass

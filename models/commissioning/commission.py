@@ -37,9 +37,7 @@ from models.diagnosis.sensors.disagreement import crossed_planes
 from models.diagnosis.sensors.reference import Naming, learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
-from models.diagnosis.window.excluded import KnownLine
 from models.diagnosis.window.moments import states_of
-from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.levels.limits import GrowthToAlert, alerts_of
 from models.levels.places import learn_gains, place_of
@@ -275,6 +273,10 @@ def commission(
     if pieces and not refused:
         channels = [machine.sensors[column] for column in recordings[0].plan.columns]
         bands = [[p.levels.bands for p in pieces if p.recording == one.name and p.levels.bands] for one in recordings]
+        # Without a theory, only lines that can be taken out of correlations are excluded.
+        everywhere = knowledge.level is not KnowledgeLevel.NONE
+        excluded = [(line, one) for one in windows for line in one.lines if everywhere or line.power is not None]
+        lines = {line.known(one.speed_rad_s) for line, one in excluded}
         commissioned = Commissioned(
             site=machine.site,
             machine=machine.name,
@@ -288,7 +290,7 @@ def commission(
             identified=learned.identified,
             gyroscopic=learned.gyroscopic,
             misfit=_healthy_misfit(machine, learned, pieces),
-            lines=_excluded(windows, everywhere=knowledge.level is not KnowledgeLevel.NONE),
+            lines=tuple(sorted(lines)),
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
@@ -302,12 +304,6 @@ def commission(
         )
     report = _report(machine, recordings, checks, learned, commissioned, pieces, wished)
     return Commissioning(report, commissioned, learned.machine)
-
-
-def _excluded(windows: Sequence[WindowStatistics], *, everywhere: bool) -> tuple[KnownLine, ...]:
-    """Lines that were excluded and will be; without `everywhere`, only those that can be taken out of correlations."""
-    lines = [(line, window) for window in windows for line in window.lines if everywhere or line.power is not None]
-    return tuple(sorted({line.known(window.speed_rad_s) for line, window in lines}))
 
 
 def _only_levels(machine: MachineFile, text: str) -> Check:

@@ -77,9 +77,7 @@ def healthy_from_blocks(
         if not verdict.continuous or verdict.new_snapshot:
             window.gap()
         for _ in window.feed(plan.to_si(block.samples), block.start_ns):
-            hop = window.latest_hop
-            if hop is not None:
-                stretches[-1].append(hop)
+            stretches[-1].append(window.hops[-1])
     running = [part for stretch in stretches for part in _without_stops(plan, stretch)]
     kept, counts = tuple(tuple(part) for part in running if part), tuple(sorted(refused.items()))
     stopped_s = (sum(map(len, stretches)) - sum(map(len, running))) * plan.fresh / plan.rate_hz

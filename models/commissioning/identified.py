@@ -245,7 +245,9 @@ def _first_guess(
     spread = max((abs(one / speed - 1) for one in speeds), default=0.0)
     tolerance = max(_LEAST_TOLERANCE, 1.5 * spread)
     operation = machine.operation or Operation(speed_rpm=speed * 30 / math.pi, speed_tolerance=tolerance)
-    guesses = {"e_m": _first_e(windows), **by_forces}
+    # e of the order of the synchronous motion; never 0, because e is read as a ratio.
+    sizes = [float(np.max(np.abs(window.synchronous))) for window in windows if window.synchronous is not None]
+    guesses = {"e_m": float(np.clip(np.median(sizes), 1e-7, 1e-3)) if sizes else 1e-6, **by_forces}
     given: dict[str, float] = known.model_dump(exclude_none=True)
     if "k_by_N_per_m" not in guesses or "k_bz_N_per_m" not in guesses:
         guesses |= _from_peak({**guesses, **given}, windows, start[2:])
@@ -257,12 +259,6 @@ def _first_guess(
     condition = machine.condition or ConditionRange(cutoff_hz=(low_hz, high_hz))
     tables = {"rotor": RotorParameters.model_validate(fields), "operation": operation, "condition": condition}
     return Machine.model_validate(machine.model_dump() | tables)
-
-
-def _first_e(windows: Sequence[WindowStatistics]) -> float:
-    """First e, of the order of the synchronous motion; never 0, because e is read as a ratio."""
-    sizes = [float(np.max(np.abs(window.synchronous))) for window in windows if window.synchronous is not None]
-    return float(np.clip(np.median(sizes), 1e-7, 1e-3)) if sizes else 1e-6
 
 
 def _from_forces(m2_kg: float | None, windows: Sequence[WindowStatistics]) -> dict[str, float]:

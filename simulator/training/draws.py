@@ -5,11 +5,13 @@ statistics as live data. Its random numbers come from (seed, purpose, equation, 
 made in any order by any number of processes, and no purpose ever shares a realisation with another.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -169,14 +171,25 @@ def simulate_scenario(scenario: Scenario, machine: Machine) -> WindowStatistics:
 def windows(
     draw: Draw, numbers: Sequence[int], processes: int, progress: Callable[[int], None] = lambda _: None
 ) -> Iterator[WindowStatistics]:
-    """Simulate windows over worker processes, in order; with one, in this process."""
-    make = partial(simulate_window, draw)
+    """Simulate windows, see `made_by`."""
+    for statistics in made_by(processes, partial(simulate_window, draw), numbers):
+        yield statistics
+        progress(1)
+
+
+_Made = TypeVar("_Made")
+
+
+def made_by(processes: int, make: Callable[[int], _Made], numbers: Iterable[int]) -> Iterator[_Made]:
+    """Make something of each number, in order, in worker processes a few ahead of their use; with one, in this one."""
     if processes == 1:
-        for number in numbers:
-            yield make(number)
-            progress(1)
+        yield from map(make, numbers)
         return
     with ProcessPoolExecutor(processes) as pool:
-        for statistics in pool.map(make, numbers, chunksize=2):
-            yield statistics
-            progress(1)
+        waiting: deque[Future[_Made]] = deque()
+        for number in numbers:
+            waiting.append(pool.submit(make, number))
+            if len(waiting) > 2 * processes:
+                yield waiting.popleft().result()
+        for made in waiting:
+            yield made.result()

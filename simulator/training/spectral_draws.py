@@ -19,9 +19,7 @@ Inputs of the networks are drawn in numbered batches. A batch depends on (seed, 
 may make them in any order.
 """
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -35,7 +33,7 @@ from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix, changed
 from models.signals.block import ComplexArray, Float32Array, FloatArray
-from simulator.training.draws import Purpose
+from simulator.training.draws import Purpose, made_by
 
 _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], ComplexArray)
 # Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
@@ -305,15 +303,5 @@ def _centres(machine: Machine, centre: FloatArray, near: bool) -> Iterator[tuple
 
 
 def batches(draws: FeatureDraws, count: int, processes: int) -> Iterator[Batch]:
-    """Batches 0 to `count` - 1 in order, made by worker processes a few ahead of their use."""
-    if processes == 1:
-        yield from map(draws.batch, range(count))
-        return
-    with ProcessPoolExecutor(processes) as pool:
-        ahead = 2 * processes
-        waiting = deque(pool.submit(draws.batch, number) for number in range(min(ahead, count)))
-        for number in range(count):
-            made = waiting.popleft().result()
-            if number + ahead < count:
-                waiting.append(pool.submit(draws.batch, number + ahead))
-            yield made
+    """Batches 0 to `count` - 1 in order, see `made_by`."""
+    return made_by(processes, draws.batch, range(count))

@@ -157,11 +157,6 @@ class SlidingWindow:
         """When the oldest samples in the window begin, including the history that its first hop needs."""
         return self._hops[0].start_ns - round((self.plan.need - self.plan.fresh) * 1e9 / self.plan.rate_hz)
 
-    @property
-    def latest_hop(self) -> HopMoments | None:
-        """The hop that was completed last."""
-        return self._hops[-1] if self._hops else None
-
     def feed(self, samples: SampleArray, start_ns: int) -> Iterator[int]:
         """Add samples that continue the previous ones, and yield the end time of every completed hop.
 
