@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import process_time
@@ -15,11 +16,14 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Z95, Diagnostician
-from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.verdict.calibration import widened
+from models.diagnosis.verdict.isolation import isolate_window, reading_of
+from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
+from rotorwatch.records.windows import Parameter
 from simulator.training.draws import Layout
 
 RATES = (0.01, 0.001)  # declared false-alarm rates per window at which results are evaluated, the strict one last
@@ -95,10 +99,25 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
         said |= {parameter.name: change, f"{parameter.name} error": error_}
     for prefix, rate in zip(("", "strict "), rates, strict=False):
         verdict = isolate_window(diagnosis, rate)
+        stretch = stretch_of(widened(diagnosis, rate), 0, 0).complete().believed()
+        named = restricted(stretch, verdict.changed, one.by)
         said |= {f"{prefix}named": " ".join(verdict.changed), f"{prefix}outside": verdict.outside}
-        said[f"{prefix}largest"] = max((abs(one.relative_change or 0.0) for one in verdict.readings), default=0.0)
+        said[f"{prefix}largest"] = max((abs(read.relative_change or 0.0) for read in named), default=0.0)
     misfit = None if diagnosis.misfit_z is None else round(diagnosis.misfit_z, 3)
     return said | {"misfit": misfit, "suspect": diagnosis.suspect}
+
+
+def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
+    """Read some parameters with all others held at nominal; those that were not evaluable are left out."""
+    chosen = [i for i in stretch.known if PARAMETERS[i] in names]
+    if not chosen:
+        return ()
+    covariance = np.linalg.inv(stretch.information[np.ix_(chosen, chosen)])
+    values = covariance @ stretch.vector[chosen]
+    return tuple(
+        reading_of(stretch, PARAMETERS[i], by, value, math.sqrt(variance))
+        for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True)
+    )
 
 
 def truth(faults: Mapping[str, float]) -> dict[str, Value]:

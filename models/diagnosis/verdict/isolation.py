@@ -42,9 +42,6 @@ class Isolation:
     changed: tuple[str, ...]  # parameters that changed, in the order of `PARAMETERS`; empty: none
     confidence: float  # posterior probability of exactly this set among all sets
     probability: tuple[float, ...]  # posterior probability of each of `PARAMETERS` to be among the changed ones
-    # The changed parameters with all others held at nominal: sharper than the free estimates, and right if the verdict
-    # is.
-    readings: tuple[Parameter, ...] = ()
     # The window is further from the model than sampling explains: something changed that no parameter describes, or a
     # sensor is at fault. The verdict on the parameters is then of low confidence.
     outside: bool = False
@@ -73,8 +70,8 @@ def outside_confidence(misfit_z: float) -> float:
 def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     """Decide one window by itself at a declared rate of false alarms per window; the test of the model has the same."""
     stretch = stretch_of(widened(diagnosis, rate), 0, 0).complete().believed()
-    isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
-    return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
+    isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))))
+    return replace(isolation, changed=(), outside=True) if stretch.unexplained else isolation
 
 
 def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | None]:
@@ -95,13 +92,13 @@ def misfit_beside(stretch: Stretch, names: Collection[str]) -> float:
     return max(misfit_z, -float(ndtri(max(chdtrc(len(others), chi2), 1e-300))))
 
 
-def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
+def isolate(stretch: Stretch, thresholds: Thresholds) -> Isolation:
     """Decide a stretch of data."""
     known = stretch.known
     outside, confidence = model_test(stretch, thresholds)
     probability = np.zeros(len(PARAMETERS))
     if not known:
-        return Isolation((), 1.0, tuple(probability.tolist()), (), outside, confidence)
+        return Isolation((), 1.0, tuple(probability.tolist()), outside, confidence)
     members = _members(len(known))
     J = stretch.information[np.ix_(known, known)]
     b = stretch.vector[list(known)]
@@ -123,7 +120,6 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         changed=changed,
         confidence=float(weight[best]),
         probability=tuple(np.minimum(probability, 1.0).tolist()),
-        readings=restricted(stretch, changed, by),
         outside=outside,
         outside_confidence=confidence,
         alternatives=_alternatives(stretch.names, members, weight, explained) if changed else (),
@@ -187,19 +183,6 @@ def _explained(J: FloatArray, b: FloatArray, members: FloatArray) -> FloatArray:
     alone[:, range(b.size), range(b.size)] = 1.0
     own = b * scale * members
     return np.asarray(np.sum(own * np.linalg.solve(alone, own[:, :, None])[:, :, 0], axis=1), dtype=np.float64)
-
-
-def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
-    """Read some parameters with all others held at nominal; those that were not evaluable are left out."""
-    chosen = [i for i in stretch.known if PARAMETERS[i] in names]
-    if not chosen:
-        return ()
-    covariance = np.linalg.inv(stretch.information[np.ix_(chosen, chosen)])
-    values = covariance @ stretch.vector[chosen]
-    return tuple(
-        reading_of(stretch, PARAMETERS[i], by, value, math.sqrt(variance))
-        for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True)
-    )
 
 
 def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> Parameter:

@@ -184,7 +184,7 @@ class SequentialTest:
             outside, confidence = model_test(by, self._thresholds(deciding[-1]))
         outside = self._is_outside(outside or bool(unexplained), by, own[window_hops])
         loud = {hops: look for hops, look in every.items() if self._is_loud(hops, look)}
-        found = {hops: isolate(look, self._thresholds(hops), self._by) for hops, look in loud.items()}
+        found = {hops: isolate(look, self._thresholds(hops)) for hops, look in loud.items()}
         verdicts = {hops: verdict for hops, verdict in found.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
         self._decided = max(decided, every[window_hops], key=lambda look: look.duration_s)
@@ -312,7 +312,7 @@ class SequentialTest:
                 if leader is not None:
                     return look, leader
         shown = self.settings.window_hops if self.settings.window_hops in clean else min(clean, default=min(every))
-        verdict = isolate(every[shown], self._thresholds(shown), self._by)
+        verdict = isolate(every[shown], self._thresholds(shown))
         return every[shown], replace(verdict, changed=())  # nothing that a straddling stretch names is believed
 
     def _leader(self, look: Stretch, verdict: Isolation, clean: Mapping[int, Stretch]) -> Isolation | None:

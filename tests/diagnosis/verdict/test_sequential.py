@@ -243,9 +243,9 @@ def test_a_change_too_small_to_be_named_is_not_fixed_at_zero() -> None:
         alone += named == [0]
         found = read_changes([look], named, 5 * 10**9, 0)
         held += bool(abs(found.values[0] - np.log(0.7)) <= Z95 * found.errors[0])
-        (restricted,) = [one for one in isolate(look, SETTINGS.thresholds(12)).readings if one.name == "k_by"]
-        low, high = restricted.interval_95 or (0.0, 0.0)
-        nominal += low <= -0.3 <= high
+        covariance = np.linalg.inv(look.information[np.ix_(named, named)])  # with all others held at nominal
+        off = (covariance @ look.vector[named])[0] - np.log(0.7)
+        nominal += bool(abs(off) <= Z95 * np.sqrt(covariance[0, 0]))
     assert alone > 75
     assert held >= 70 > 20 > nominal  # the probability that the other changed differs between windows
 
