@@ -294,8 +294,7 @@ class Left(NamedTuple):
 
     single: float  # only the best of the parameters changed
     common: float  # one factor on all of them, as from a wrong gain
-    factor: float  # logarithm of that factor
-    z: float  # the logarithm in standard errors
+    z: float  # the logarithm of that factor in standard errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,7 +360,7 @@ class Diagnosis:
         weight = float(ones @ J @ ones)
         factor = float(ones @ b) / weight
         single = float(np.min(everything - b**2 / np.diag(J)))
-        return Left(single, everything - factor**2 * weight, factor, factor * math.sqrt(weight))
+        return Left(single, everything - factor**2 * weight, factor * math.sqrt(weight))
 
 
 class Diagnostician(Protocol):

@@ -8,6 +8,7 @@ with a single sensor, or several on one transducer, the common factor is the onl
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
@@ -38,43 +39,33 @@ _MOST_LOSS = -0.95
 _SURE = 3.0  # standard errors up to which the size of a change is not in doubt
 
 
-@dataclass(frozen=True, slots=True)
-class GainSuspicion:
-    """A common factor that explains the row's own parameters as well as separate changes do."""
-
-    sentence: str  # ``gain of y1 or of y2``
-    factor: float  # relative change of all of the row's own parameters
-    # The factor in standard errors, as a one-sided normal variable that allows for the number of rows tested.
-    z: float
-
-
 def gain_suspicion(
     diagnosis: Diagnosis, rows: Sequence[Row], relations: Sequence[Relation | None]
-) -> GainSuspicion | None:
-    """Find the row whose changes look most like a gain error of all sensors of a place.
+) -> tuple[float, str]:
+    """Find the row whose changes look most like a gain error of all sensors of a place: ``gain of y1 or of y2``.
 
-    None if single parameters explain the changes of every row, or a common factor does not.
+    A common factor explains its own parameters as well as separate changes do. With it comes that factor in standard
+    errors, as a one-sided normal variable that allows for the number of rows tested. The sentence is empty if single
+    parameters explain the changes of every row, or a common factor does not.
     """
     tested = [
         (row, relation)
         for row, relation in zip(rows, relations, strict=True)
         if relation is not None and len(row.own) > 1
     ]
-    found = [_row_suspicion(diagnosis, row, relation, len(tested)) for row, relation in tested]
-    return max((one for one in found if one is not None), key=lambda one: one.z, default=None)
-
-
-def _row_suspicion(diagnosis: Diagnosis, row: Row, relation: Relation, tested: int) -> GainSuspicion | None:
-    left = diagnosis.left_by([own.parameter for own in row.own])
-    if left is None or left.single <= _SINGLE**2 or left.common > _COMMON**2:
-        return None
-    tail = 2 * tested * float(ndtr(-abs(left.z)))
-    z = -float(ndtri(min(0.5, max(tail, 1e-300))))
-    places = [
-        " and ".join(name for name in relation.states if name == coordinate or name.startswith(f"{coordinate}_"))
-        for coordinate in dict.fromkeys(motion.coordinate for motion in row.motions)
-    ]
-    return GainSuspicion(f"gain of {' or of '.join(filter(None, places))}", math.expm1(left.factor), z)
+    found = []
+    for row, relation in tested:
+        left = diagnosis.left_by([own.parameter for own in row.own])
+        if left is None or left.single <= _SINGLE**2 or left.common > _COMMON**2:
+            continue
+        tail = 2 * len(tested) * float(ndtr(-abs(left.z)))
+        places = [
+            " and ".join(name for name in relation.states if name == coordinate or name.startswith(f"{coordinate}_"))
+            for coordinate in dict.fromkeys(motion.coordinate for motion in row.motions)
+        ]
+        z = -float(ndtri(min(0.5, max(tail, 1e-300))))
+        found.append((z, f"gain of {' or of '.join(filter(None, places))}"))
+    return max(found, key=itemgetter(0), default=(0.0, ""))
 
 
 _WORST_ERROR = 0.2
@@ -94,18 +85,6 @@ class _Bearing:
     noise: FloatArray  # (n_own, n_own), covariance from the window alone
     sensitivity: FloatArray  # (n_own, n_coefficients), to the relations' coefficients
     common: FloatArray  # (n_own, n_own), covariance from the commissioning
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Unbalance:
-    """Change of the unbalance, its variance, its covariance with the bearing's changes, and what commissioning adds."""
-
-    value: float
-    covariance: FloatArray
-    variance: float
-    common_covariance: FloatArray
-    common_variance: float
-    slope: FloatArray  # (n_own,), derivative with respect to the bearing's changes
 
 
 class BaselineDiagnostician:
@@ -163,15 +142,10 @@ class BaselineDiagnostician:
             names.append("e")
             reasons["e"] = ""
             try:
-                e = self._unbalance(changes, bearing, window)
+                values, total, common, through = self._with_unbalance(changes, bearing, window)
             except EstimationError as error:
                 reasons["e"] = str(error)
                 foreign = reasons["e"] if isinstance(error, ForeignRotationError) else ""
-            else:
-                values = np.append(values, e.value)
-                total = _bordered(total, e.covariance, e.variance)
-                common = _bordered(common, e.common_covariance, e.common_variance)
-                through = np.vstack([through, e.slope])
         same = self._as_commissioned(changes)
         if not same:
             least = _OTHER_FORCE if self._one_condition else 1.0
@@ -209,12 +183,12 @@ class BaselineDiagnostician:
         )
         if impossible:
             return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), unexplained=impossible)
-        suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
-        if suspicion is None:
+        z, suspect = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else (0.0, "")
+        if not suspect:
             abstains = self._one_condition and not same
             return replace(diagnosis, unexplained=_unexplained(diagnosis.misfit_z)) if abstains else diagnosis
-        misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
-        return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
+        misfit = z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, z)
+        return replace(diagnosis, misfit_z=misfit, suspect=suspect)
 
     def _as_commissioned(self, changes: Sequence[RowChange | None]) -> bool:
         """Whether the force, computed with the changes of the window, is the commissioned one."""
@@ -275,8 +249,14 @@ class BaselineDiagnostician:
                     common[place, place] += max(0.0, (1 + values[place]) ** 2 - 1) * relative
         return _Bearing(values, noise, sensitivity, common)
 
-    def _unbalance(self, changes: list[RowChange | None], bearing: _Bearing, window: WindowStatistics) -> _Unbalance:
-        """Read the unbalance; raises EstimationError with the reason why it cannot be read."""
+    def _with_unbalance(
+        self, changes: list[RowChange | None], bearing: _Bearing, window: WindowStatistics
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Changes of the bearing and of the unbalance, their covariance, and that from the commissioning alone.
+
+        Last their Jacobian with respect to the bearing's changes. Raises EstimationError with the reason why the
+        unbalance cannot be read.
+        """
         rows = [
             self._forces[row.name]
             for row, change in zip(self._rows, changes, strict=True)
@@ -322,8 +302,10 @@ class BaselineDiagnostician:
             raise EstimationError(
                 f"unbalance not determined well enough: standard error {text} %, limit for a reading {limit} %"
             )
-        common_variance = float(along @ shared @ along)
-        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, common_variance, along @ to_d)
+        both = _bordered(bearing.noise + bearing.common, with_bearing @ along, variance)
+        common = _bordered(bearing.common, shared_with @ along, float(along @ shared @ along))
+        slopes = np.vstack([np.eye(bearing.values.size), along @ to_d])
+        return np.append(bearing.values, size - 1), both, common, slopes
 
     def _rotations(
         self, coordinates: tuple[str, ...], window: WindowStatistics
