@@ -32,7 +32,7 @@ async def measured(healths: list[Health], listeners: int, whole: Any) -> tuple[f
     """Processor load as a fraction of a core, and bytes per second of one stream."""
     feed, ended, heard = EventFeed(), threading.Event(), 0
     places = {f"{one.site}/{one.machine}": one for one in healths}
-    logs: Any = dict.fromkeys(places, SimpleNamespace(last_sequence=lambda: -1))
+    logs: Any = dict.fromkeys(places, SimpleNamespace(last_sequence=-1))
 
     async def admitted() -> bool:
         return True

@@ -171,11 +171,11 @@ class EventFeed:
                 closes = self.closed
                 listener.woken = False
                 listener.news.clear()
-                behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
+                behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence]
                 for place in behind:
                     async for event in self._alarm_events(place, logs[place], cursor):
                         yield event
-                waits = any(cursor[place] < logs[place].last_sequence() for place in behind)
+                waits = any(cursor[place] < logs[place].last_sequence for place in behind)
                 changed = self._health_after(number)
                 for place, said in changed:
                     number = said.number
@@ -222,7 +222,7 @@ class EventFeed:
 
     async def _alarm_events(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
         """Events in the log after the cursor, which moves along; none while the history cannot be read."""
-        while cursor[place] < log.last_sequence():
+        while cursor[place] < log.last_sequence:
             try:
                 page = await run_in_threadpool(log.events, after=cursor[place], limit=_PAGE)
             except StoreError:

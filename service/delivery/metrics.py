@@ -218,7 +218,7 @@ _FAMILIES: tuple[_Family[Observed], ...] = (
     _Family("counter", "alarm_events_total", "Alarm events in the history since the start, by kind",
             lambda machine: (((kind.value,), machine.events.get(kind.value, 0)) for kind in EventKind), ("kind",)),
     _Family("gauge", "alarm_sequence", "Number of the latest alarm event, -1 before the first; goes on across restarts",
-            lambda machine: machine.monitored.history.last_sequence()),
+            lambda machine: machine.monitored.history.last_sequence),
     _Family("gauge", "recorder_state", "1 for the state the recorder is in, 0 for others", _recorder_state, ("state",)),
     _Family("counter", "recorder_received_messages_total", "Messages that arrived at the recorder",
             _recorded(lambda recorder: recorder.received)),
@@ -284,7 +284,7 @@ class Metrics:
 
     def watch(self, machine: Monitored) -> None:
         """Count the alarm events of a machine from now on."""
-        self._events[machine.machine.title] = machine.history.last_sequence(), Counter()
+        self._events[machine.machine.title] = machine.history.last_sequence, Counter()
 
     def text(self) -> bytes:
         """Everything in the text format of Prometheus; for any thread."""
@@ -313,7 +313,7 @@ class Metrics:
         """Count the events that have come since the last time; while the history cannot be read, nothing is added."""
         after, kinds = self._events[machine.machine.title]
         with suppress(StoreError):
-            while after < machine.history.last_sequence():
+            while after < machine.history.last_sequence:
                 page = machine.history.events(after=after, limit=_PAGE)
                 if not page:
                     break

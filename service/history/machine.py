@@ -24,8 +24,7 @@ from service.history.records import (
 )
 from service.history.shared import EVENT, ReportLog
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evidence, reports, series, windows
-from service.history.trend import trend
-from service.history.windows import READING, unpacked
+from service.history.windows import READING, trend, unpacked
 from service.history.writer import Writer
 
 _AT_ONCE = 1000  # windows
@@ -43,41 +42,18 @@ class MachineStore:
     def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
         self.title = claim.title
         self.report_log = ReportLog(database, claim.site, claim.name)
-        self._database = database
+        self.database = database
         self._writer = writer
-        self._claim = claim
+        self.claim = claim
         self._now_ns = now_ns
         log = alarm_events.c
         latest = select(func.max(log.sequence)).where(log.machine_id == claim.machine_id)
-        self._last_sequence: int = next((last for (last,) in database.rows(latest) if last is not None), -1)
-
-    @property
-    def waiting(self) -> int:
-        """Steps that are not in the database yet."""
-        return self._claim.steps
-
-    @property
-    def trouble(self) -> str:
-        """Why the database does not take what waits although it works; empty if it does."""
-        return self._claim.trouble
-
-    @property
-    def generation(self) -> int:
-        """Goes up when the history continues in another file, which may lack what was written before."""
-        return self._claim.generation
-
-    @property
-    def news(self) -> str:
-        """What happened to the file when the generation last went up."""
-        return self._database.news
+        # Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none.
+        self.last_sequence: int = next((last for (last,) in database.rows(latest) if last is not None), -1)
 
     def go_on_from(self, sequence: int) -> None:
         """Number the next alarm event after this one, even if the log of a file that was begun anew has fewer."""
-        self._last_sequence = max(self._last_sequence, sequence)
-
-    def last_sequence(self) -> int:
-        """Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none."""
-        return self._last_sequence
+        self.last_sequence = max(self.last_sequence, sequence)
 
     def commit(self, step: Step) -> bool:
         """Write the results of one block, whole or not at all, in order.
@@ -92,7 +68,7 @@ class MachineStore:
         -------
         bool
             True if it is in the database, for good. False if the database fails: the step waits in memory and is
-            written before all later ones, which is tried every second. Meanwhile `Store.trouble` says why. What waits
+            written before all later ones, which is tried every second. Meanwhile `Writer.trouble` says why. What waits
             is bounded: the oldest reports and readings are dropped first; alarm events are never dropped.
 
         Raises
@@ -102,21 +78,21 @@ class MachineStore:
             an alarm event whose sequence or id is in the history with another id or sequence, or another monitor that
             has taken over the machine.
         """
-        before = self._last_sequence
+        before = self.last_sequence
         last = self._follow(step.events)
         recorded_ns = self._now_ns()
         packed = pack(self.title, step, recorded_ns)
-        self._last_sequence = last
+        self.last_sequence = last
         try:
-            return self._writer.submit(self._claim, step, packed, recorded_ns)
+            return self._writer.submit(self.claim, step, packed, recorded_ns)
         except StoreError:
-            self._last_sequence = before
+            self.last_sequence = before
             raise
 
     def restore(self) -> Checkpoint | None:
         """State of the monitor after the last committed step, or None if there is none."""
-        parts, machine_id = checkpoint_parts.c, self._claim.machine_id
-        with self._database.reading() as connection:
+        parts, machine_id = checkpoint_parts.c, self.claim.machine_id
+        with self.database.reading() as connection:
             head = connection.execute(select(*_HEAD).where(checkpoints.c.machine_id == machine_id)).one_or_none()
             if head is None:
                 return None
@@ -131,21 +107,21 @@ class MachineStore:
     def evidence(self, alarm: str, occurrence: int | None = None) -> str | None:
         """Evidence of an occurrence of an alarm, or of its latest one; None if nothing was kept."""
         kept = evidence.c
-        query = select(kept.text).where(kept.machine_id == self._claim.machine_id, kept.alarm == alarm)
+        query = select(kept.text).where(kept.machine_id == self.claim.machine_id, kept.alarm == alarm)
         if occurrence is not None:
             query = query.where(kept.occurrence == occurrence)
-        rows = self._database.rows(query.order_by(kept.occurrence.desc()).limit(1))
+        rows = self.database.rows(query.order_by(kept.occurrence.desc()).limit(1))
         return zstandard.decompress(rows[0].text).decode() if rows else None
 
     def keep_evidence(self, alarm: str, occurrence: int, text: str) -> None:
         """Keep the evidence of an occurrence of an alarm, replacing what was kept; beyond 500, the oldest go."""
-        kept, own = evidence.c, evidence.c.machine_id == self._claim.machine_id
+        kept, own = evidence.c, evidence.c.machine_id == self.claim.machine_id
         values = {"recorded_ns": self._now_ns(), "text": zstandard.compress(text.encode())}
-        key = {"machine_id": self._claim.machine_id, "alarm": alarm, "occurrence": occurrence}
-        made = self._database.insert(evidence).values(**key, **values)
+        key = {"machine_id": self.claim.machine_id, "alarm": alarm, "occurrence": occurrence}
+        made = self.database.insert(evidence).values(**key, **values)
         made = made.on_conflict_do_update(index_elements=list(key), set_=values)
         newest = select(kept.recorded_ns).where(own).order_by(kept.recorded_ns.desc()).limit(1).offset(_MOST_EVIDENCE)
-        with self._database.writing() as connection:
+        with self.database.writing() as connection:
             connection.execute(made)
             connection.execute(delete(evidence).where(own, kept.recorded_ns <= newest.scalar_subquery()))
 
@@ -165,7 +141,7 @@ class MachineStore:
         """Alarm events with after < sequence < before and since_ns ≤ time_ns < until_ns, in order, at most `limit`."""
         log = alarm_events.c
         query = select(*EVENT).where(
-            log.machine_id == self._claim.machine_id,
+            log.machine_id == self.claim.machine_id,
             *_between(log.time_ns, since_ns, until_ns),
             *(
                 column == value
@@ -176,7 +152,7 @@ class MachineStore:
             *_between(log.sequence, None, before),
         )
         query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
-        return tuple(StoredEvent(*row) for row in self._database.rows(query))
+        return tuple(StoredEvent(*row) for row in self.database.rows(query))
 
     def reports(
         self, *, since_ns: int | None = None, until_ns: int | None = None, before: int | None = None, limit: int = 100
@@ -187,7 +163,7 @@ class MachineStore:
         """
         report = reports.c
         query = select(report.number, report.start_ns, report.end_ns, report.state, report.filled, report.text)
-        with self._database.reading() as connection:
+        with self.database.reading() as connection:
             chosen = self._windows(connection, report, since_ns, until_ns)
             query = query.where(*chosen, *_between(report.number, None, before)).order_by(report.number.desc())
             rows = connection.execute(query.limit(_checked(limit))).all()
@@ -208,10 +184,10 @@ class MachineStore:
         At most `limit` with a number greater than `after`, which is the last number of the page before.
         """
         window, of, found = windows.c, series.c, list[Reading]()
-        named = (of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name)
+        named = (of.machine_id == self.claim.machine_id, of.quantity == quantity, of.name == name)
         query = select(window.number, window.end_ns, window.readings).order_by(window.number)
         query = query.execution_options(yield_per=min(_checked(limit), _AT_ONCE))
-        with self._database.reading() as connection:
+        with self.database.reading() as connection:
             series_id = connection.scalar(select(of.series_id).where(*named))
             chosen = self._windows(connection, window, since_ns, until_ns)
             chosen += [] if after is None else [window.number > after]
@@ -230,8 +206,8 @@ class MachineStore:
     def names_of(self, quantity: str) -> frozenset[str]:
         """All names that were ever read as this quantity, also with an earlier machine file."""
         of = series.c
-        query = select(of.name).where(of.machine_id == self._claim.machine_id, of.quantity == quantity)
-        return frozenset(name for (name,) in self._database.rows(query))
+        query = select(of.name).where(of.machine_id == self.claim.machine_id, of.quantity == quantity)
+        return frozenset(name for (name,) in self.database.rows(query))
 
     def downsampled(
         self,
@@ -257,23 +233,23 @@ class MachineStore:
         points : int
             At most this many buckets for each name; those without a reading are left out.
         """
-        with self._database.reading() as connection:
-            of = connection, self._claim.machine_id, self._writer.bucket_ns
+        with self.database.reading() as connection:
+            of = connection, self.claim.machine_id, self._writer.bucket_ns
             return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
 
     def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[StoredBucket, ...]:
         """Readings of one name in the last `span_ns` up to the newest window, reduced like those of `downsampled`."""
         window = windows.c
-        newest = select(window.end_ns).where(window.machine_id == self._claim.machine_id)
-        with self._database.reading() as connection:
+        newest = select(window.end_ns).where(window.machine_id == self.claim.machine_id)
+        with self.database.reading() as connection:
             end_ns = connection.scalar(newest.order_by(window.end_ns.desc()).limit(1))
-            of = connection, self._claim.machine_id, self._writer.bucket_ns
+            of = connection, self.claim.machine_id, self._writer.bucket_ns
             since_ns = max(0, (end_ns or 0) - span_ns)
             return trend(*of, quantity, [name], since_ns, None, _checked(points))
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
         """The last sequence after these events; raises `StoreError` at a gap or a repeated id."""
-        last = self._last_sequence
+        last = self.last_sequence
         for event in events:
             if event.sequence > last + 1:
                 raise StoreError(f"{self.title}: alarm event {event.sequence} comes after {last}, expected {last + 1}")
@@ -291,7 +267,7 @@ class MachineStore:
         until_ns: int | None,
     ) -> list[ColumnElement[bool]]:
         """Conditions on windows; if time is asked for, on their numbers too, along which pages are read."""
-        chosen = [column.machine_id == self._claim.machine_id, *_between(column.end_ns, since_ns, until_ns)]
+        chosen = [column.machine_id == self.claim.machine_id, *_between(column.end_ns, since_ns, until_ns)]
         if since_ns is None and until_ns is None:
             return chosen
         bounds = connection.execute(select(func.min(column.number), func.max(column.number)).where(*chosen)).one()

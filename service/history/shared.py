@@ -83,7 +83,10 @@ class AuditLog:
 
     def append(self, at_ns: int, status: int, **texts: str) -> int:
         """Write an entry and return its number; `texts` are all other fields of an `AuditRecord`."""
-        storable = {name: _storable(text) for name, text in texts.items()}
+        # With those characters escaped that a request may hold but no database takes.
+        storable = {
+            name: text.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode() for name, text in texts.items()
+        }
         entry = insert(audit_log).values(at_ns=at_ns, status=status, **storable)
         with self._database.writing() as connection:
             number: int = connection.execute(entry.returning(audit_log.c.number)).scalar_one()
@@ -104,11 +107,6 @@ class AuditLog:
         for column, value in ((audit_log.c.machine, machine), (audit_log.c.actor, actor)):
             query = query if value is None else query.where(column == value)
         return tuple(AuditRecord.model_validate(dict(row._mapping)) for row in self._database.rows(query))
-
-
-def _storable(text: str) -> str:
-    """A text with those characters escaped that a request may hold but no database takes."""
-    return text.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
 
 
 _TOKEN = [tokens.c[name] for name in TokenRecord.__dataclass_fields__]

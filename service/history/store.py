@@ -65,7 +65,7 @@ class Store:
     >>> store = Store("sqlite:///:memory:", Retention())
     >>> store.open()
     >>> lab = store.machine("demo", "lab")
-    >>> lab.last_sequence(), lab.restore()
+    >>> lab.last_sequence, lab.restore()
     (-1, None)
     >>> store.close()
     """
@@ -81,38 +81,23 @@ class Store:
         now_ns: Callable[[], int] = time.time_ns,
         shared: bool = False,
     ) -> None:
-        self._database = Database(url, timeout_s)
-        self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9, shared=shared)
+        self.database = Database(url, timeout_s)
+        self.writer = Writer(self.database, retry_s, waiting_reports, retention.bucket_s * 10**9, shared=shared)
         self._shared = shared
-        self.reduction = Reduction(self._database, retention, now_ns)
+        self.reduction = Reduction(self.database, retention, now_ns)
         self._now_ns = now_ns
         self._retention = retention
-        self.alarms_since = partial(alarms_since, self._database)
-        self.tokens = TokenStore(self._database)
-        self.audit = AuditLog(self._database)
-        self.webhooks = WebhookCursors(self._database)
-
-    @property
-    def shown(self) -> str:
-        """The database's URL without its password."""
-        return self._database.shown
-
-    @property
-    def trouble(self) -> str:
-        """Why the latest write failed; empty if it did not."""
-        return self._writer.trouble
-
-    @property
-    def lost(self) -> str:
-        """Why something of the history is not in the present file; empty if all of it is."""
-        return self._database.lost
+        self.alarms_since = partial(alarms_since, self.database)
+        self.tokens = TokenStore(self.database)
+        self.audit = AuditLog(self.database)
+        self.webhooks = WebhookCursors(self.database)
 
     def unreachable(self) -> str:
         """Why the database takes no transaction now, even if nothing has to be written; empty if it takes one."""
-        if astray := self._database.astray():
+        if astray := self.database.astray():
             return astray
         try:
-            with self._database.writing(_PROBE_S) as connection:
+            with self.database.writing(_PROBE_S) as connection:
                 connection.execute(text("SELECT 1"))
         except StoreError as error:
             return str(error)
@@ -124,8 +109,8 @@ class Store:
         An SQLite file that is damaged is renamed and a new one begun, if it may be `set_aside`; `lost` says so. Raises
         StoreError if the database cannot be reached or used.
         """
-        self._database.start(set_aside, read_only=self._shared)
-        self._writer.start()
+        self.database.start(set_aside, read_only=self._shared)
+        self.writer.start()
         if not self._shared:
             self.reduction.start()
 
@@ -137,21 +122,21 @@ class Store:
         StoreError
             If the database does not take it, saying what is lost; everything is released all the same.
         """
-        if not self._database.is_open:
+        if not self.database.is_open:
             return
         try:
             if not self._shared:
                 self.reduction.stop()
-            self._writer.stop()
+            self.writer.stop()
         finally:
-            self._database.stop()
+            self.database.stop()
 
     def machine(self, site: str, name: str) -> MachineStore:
         """The history of a machine, which nobody else writes until this store is closed or its process ends.
 
         Raises StoreError if another monitor writes it, or the database fails.
         """
-        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns)
+        return MachineStore(self.database, self.writer, self.writer.claim(site, name), self._now_ns)
 
     def reader(self, site: str, name: str) -> MachineStore:
         """The history of a machine that another process of this monitor writes, to be read.
@@ -159,11 +144,11 @@ class Store:
         Raises StoreError if there is none, or the database fails.
         """
         query = select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
-        found = self._database.rows(query)
+        found = self.database.rows(query)
         if not found:
-            raise StoreError(f"{self.shown}: there is no history of {site}/{name}")
+            raise StoreError(f"{self.database.shown}: there is no history of {site}/{name}")
         claim = Claim(site, name, most_reports=0, machine_id=found[0][0])
-        return MachineStore(self._database, self._writer, claim, self._now_ns)
+        return MachineStore(self.database, self.writer, claim, self._now_ns)
 
     def status(self) -> HistoryStatus:
         """How large the history is, and how far back it goes. Raises StoreError if the database fails."""
@@ -173,15 +158,15 @@ class Store:
             for table, column in _OLDEST
         ]
         query = select(machines.c.site, machines.c.name, *oldest).order_by(machines.c.site, machines.c.name)
-        with self._database.reading() as connection:
-            if self._database.is_sqlite:
+        with self.database.reading() as connection:
+            if self.database.is_sqlite:
                 pages, size = (connection.scalar(text(f"PRAGMA {what}")) for what in ("page_count", "page_size"))
                 size_bytes = pages * size
             else:
                 size_bytes = connection.scalar(text("SELECT pg_database_size(current_database())"))
             rows = connection.execute(query).all()
         return HistoryStatus(
-            database="in memory, until the monitor ends" if self._database.in_memory else self._database.shown,
+            database="in memory, until the monitor ends" if self.database.in_memory else self.database.shown,
             size_bytes=size_bytes,
             machines=tuple(
                 HistorySpan(

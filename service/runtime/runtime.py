@@ -124,8 +124,8 @@ class Runtime:
             session_open=self._machines.session_open,
             machines=machines,
             history_open=self._history_open,
-            history_trouble=self.store.trouble or elsewhere or self.store.unreachable(),
-            history_lost=self.store.lost,
+            history_trouble=self.store.writer.trouble or elsewhere or self.store.unreachable(),
+            history_lost=self.store.database.lost,
             failing_webhooks=self.webhooks.failing(),
         )
 
@@ -142,8 +142,8 @@ class Runtime:
             guard = Guard(self.store.tokens, self.store.audit, self.settings.access, self.settings.http.host)
             self._machines.connect(undo)
             self.store.open(set_aside=True)
-            if self.store.lost:
-                _log.error("a new history is begun", why=self.store.lost)
+            if self.store.database.lost:
+                _log.error("a new history is begun", why=self.store.database.lost)
             undo.callback(self.store.close)
             self._history_open = True
             # Closed after the machines, whose last events they send, and before the history, where they read these.

@@ -110,7 +110,7 @@ class _Shard:
             changed = changed or sequence != self._told.get(place)
             self._told[place] = sequence
             health, status = worker.health(), worker.status()
-        status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
+        status = replace(status, history_trouble=self._store.writer.trouble, session_open=self._machines.session_open)
         return Standing(
             process=self.process,
             place=place,

@@ -236,7 +236,7 @@ class Shards:
         machine = self._remote.get(standing.place)
         if machine is None:  # its shard is not ready yet, and will be asked for the complete state
             return
-        before = machine.history.last_sequence()
+        before = machine.history.last_sequence
         machine.take(standing)
         if standing.sequence > before:
             self._listener.wake()

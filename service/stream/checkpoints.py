@@ -96,7 +96,7 @@ class StepWriter:
 
     def begun_anew(self) -> str:
         """Why everything has to be written to the history again; empty if it need not be."""
-        return "" if self._generation == self._history.generation else self._history.news
+        return "" if self._generation == self._history.claim.generation else self._history.database.news
 
     def commit(
         self, monitor: MachineMonitor, windows: tuple[Report, ...], recorded_ns: int, *, whole: bool = False
@@ -107,7 +107,7 @@ class StepWriter:
         are to be published, and whether all of it is in the database now.
         """
         self.refused = None
-        if (generation := self._history.generation) != self._generation:
+        if (generation := self._history.claim.generation) != self._generation:
             self.kept, self._generation = (), generation
         reports: tuple[StoredReport, ...] = ()
         told = tuple(self._to_publish(event, recorded_ns) for event in self.owed)

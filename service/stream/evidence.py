@@ -28,7 +28,7 @@ class EvidenceCollector:
         self._calm_ns: int | None = None  # end of the latest window kept while nothing was wrong
         # Evidence of raised alarms; None once it is complete.
         self._standing: dict[tuple[str, int], AlarmEvidence | None] = {}
-        self._generation = worker.history.generation
+        self._generation = worker.history.claim.generation
         self._limiter = Limiter()
 
     def look(self, health: Health) -> None:
@@ -37,8 +37,8 @@ class EvidenceCollector:
         if report is None or report.end_ns == self._looked_ns:
             return
         try:
-            if self._generation != self._worker.history.generation:  # the history was begun anew, without pictures
-                self._generation, self._calm_ns = self._worker.history.generation, None
+            if self._generation != (now := self._worker.history.claim.generation):  # begun anew, without pictures
+                self._generation, self._calm_ns = now, None
             elif self._looked_ns is None and (before := self._calm_picture()) is not None:
                 self._calm_ns = before.report.end_ns
             raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}

@@ -115,7 +115,7 @@ class MachineWorker:
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
         """A monitor that continues from the history if there is a checkpoint, and what was restored, in a sentence."""
-        last, checkpoint = self.history.last_sequence(), self.history.restore()
+        last, checkpoint = self.history.last_sequence, self.history.restore()
         if checkpoint is None:
             monitor = MachineMonitor(installed, self._skips)
             monitor.restore_alarms(NO_ALARMS, last + 1)
@@ -138,8 +138,8 @@ class MachineWorker:
         """Why the machine is not monitored as it should be although data come in; empty if it is."""
         refused = self.steps.refused
         reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
-        if self.history.trouble:
-            reasons.append(f"the history does not accept what happens: {self.history.trouble}")
+        if self.history.claim.trouble:
+            reasons.append(f"the history does not accept what happens: {self.history.claim.trouble}")
         if self._unevaluated_s > 2 * self.machine.hop_data_s and not self._time.silent:
             why = self._snapshot.reason
             reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
@@ -217,7 +217,7 @@ class MachineWorker:
             trouble=self.trouble,
             busy_s=round(self._pulse.busy_s, 1),
             queue_blocks=len(self.inbox),
-            history_waiting=self.history.waiting,
+            history_waiting=self.history.claim.steps,
             restart=self.restart,
             tally=replace(self.tally),
             recorder=None if self.recorder is None else self.recorder.status(),
@@ -237,7 +237,7 @@ class MachineWorker:
         StoreError
             If the database fails.
         """
-        latest = self.history.last_sequence()
+        latest = self.history.last_sequence
         events = self.history.events(after=after, limit=limit)
         return alarm_log_page(self.identity, [event.text for event in events], latest)
 

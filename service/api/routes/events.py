@@ -116,13 +116,13 @@ def _cursor(logs: Mapping[str, MachineStore], texts: tuple[str, ...], begin: str
     except CursorError as error:
         raise HTTPException(422, f"Last-Event-ID: {error}") from error
     if not given:
-        return {place: log.last_sequence() if begin == "now" else -1 for place, log in logs.items()}
+        return {place: log.last_sequence if begin == "now" else -1 for place, log in logs.items()}
     heard = given[0]
     for place, log in logs.items():
-        if heard.get(place, -1) > log.last_sequence():
+        if heard.get(place, -1) > log.last_sequence:
             raise HTTPException(
                 409,
                 f"Last-Event-ID: {cursor_text({place: heard[place]})}, but the log of {place} ends at "
-                f"{log.last_sequence()}: it is another one than you followed",
+                f"{log.last_sequence}: it is another one than you followed",
             )
     return {place: heard.get(place, -1) for place in logs}

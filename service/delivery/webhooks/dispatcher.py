@@ -86,7 +86,7 @@ class Dispatcher:
         self._now_ns = now_ns
         self._chance = chance
         wanted = (place for place in logs if any(fnmatchcase(place, pattern) for pattern in settings.machines))
-        self._lanes = tuple(_Lane(place, logs[place], logs[place].last_sequence()) for place in wanted)
+        self._lanes = tuple(_Lane(place, logs[place], logs[place].last_sequence) for place in wanted)
         self._turns = deque(self._lanes)
         self._failures = 0
         self._due_s = self._save_due_s = float("-inf")
@@ -123,7 +123,7 @@ class Dispatcher:
         """State of the webhook; for any thread."""
         settings = self.settings
         failing = bool(self._failures or any(lane.failures for lane in self._lanes))
-        pending = sum(max(0, lane.log.last_sequence() + 1 - lane.next) for lane in self._lanes if lane.next is not None)
+        pending = sum(max(0, lane.log.last_sequence + 1 - lane.next) for lane in self._lanes if lane.next is not None)
         return WebhookStatus(
             name=settings.name,
             target=settings.target,
@@ -180,7 +180,7 @@ class Dispatcher:
         """Seconds until something is due; events not committed and cursors not saved are looked after every second."""
         pauses = [self._due_s - now_s]
         for lane in self._lanes:
-            behind = lane.next is None or lane.next <= lane.log.last_sequence() or lane.saved != lane.next
+            behind = lane.next is None or lane.next <= lane.log.last_sequence or lane.saved != lane.next
             pauses.append(max(lane.due_s - now_s, _AGAIN_S) if behind else _QUIET_S)
         return max(0.0, min((pause for pause in pauses if pause > 0.0), default=_QUIET_S))
 
@@ -190,7 +190,7 @@ class Dispatcher:
             saved = self._cursors.get(self.settings.name, lane.place)
             lane.next, lane.saved = (lane.newest + 1, -1) if saved < 0 else (saved, saved)
         self._save(lane)
-        while not lane.waiting and lane.next <= lane.log.last_sequence():
+        while not lane.waiting and lane.next <= lane.log.last_sequence:
             page = lane.log.events(after=lane.next - 1, limit=_PAGE)
             if not page:
                 break

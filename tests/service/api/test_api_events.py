@@ -53,7 +53,7 @@ def shared() -> Iterator[Runtime]:
 
 def happen(worker: Monitored, count: int = 1) -> None:
     for _ in range(count):
-        kind: Any = "unshelve" if worker.history.last_sequence() % 2 == 0 else "shelve"
+        kind: Any = "unshelve" if worker.history.last_sequence % 2 == 0 else "shelve"
         worker.operate(OperatorAction(kind, "k_by", actor="anna", reason="x"))
 
 
@@ -85,7 +85,7 @@ def log(worker: Monitored) -> list[str]:
 
 def test_events_arrive_with_an_id_to_resume_from(shared: Runtime) -> None:
     lab, heavy = shared.machines()
-    before = lab.history.last_sequence(), heavy.history.last_sequence()
+    before = lab.history.last_sequence, heavy.history.last_sequence
     with reading(shared) as reader:
         start = reader.next("start")
         assert (start.id, start.retry) == (f"{LAB}={before[0]},{HEAVY}={before[1]}", 2000)
@@ -132,7 +132,7 @@ def test_the_whole_log_can_be_read_also_of_a_machine_not_in_the_cursor(shared: R
         assert found == expected
     with reading(shared, f"?from=beginning&machine={HEAVY}") as reader:
         assert [reader.next().data for _ in expected[HEAVY]] == expected[HEAVY]
-    with reading(shared, **{"last-event-id": f"{LAB}={lab.history.last_sequence()},old/pump=7"}) as reader:
+    with reading(shared, **{"last-event-id": f"{LAB}={lab.history.last_sequence},old/pump=7"}) as reader:
         assert [reader.next().data for _ in range(2)] == log(heavy)[:2]
 
 
@@ -147,7 +147,7 @@ def test_a_reader_who_reconnects_repeatedly_gets_the_exact_log(shared: Runtime) 
             happen(lab)
         done.set()
 
-    first = lab.history.last_sequence()
+    first = lab.history.last_sequence
     writer = threading.Thread(target=go_on)
     writer.start()
     found: list[str] = []
@@ -188,8 +188,8 @@ def test_health_is_sent_at_once_and_on_changes(shared: Runtime) -> None:
         begun = reader.next("health")
         assert Health.model_validate_json(begun.data).machine == "lab"
         # A health event does not change the id to resume from.
-        assert begun.id == f"{LAB}={lab.history.last_sequence()}"
-        shelved = lab.history.last_sequence() % 2 == 1
+        assert begun.id == f"{LAB}={lab.history.last_sequence}"
+        shelved = lab.history.last_sequence % 2 == 1
         told_until(not shelved, begun)  # the last change may not have been sent yet
         happen(lab)
         told_until(shelved, reader.next("health"))
@@ -234,7 +234,7 @@ def test_full_health_of_some_machines_and_overviews_of_others(shared: Runtime) -
 
     async def listen() -> list[str]:
         logs = {LAB: shared.machines()[0].history}
-        cursor = {LAB: logs[LAB].last_sequence()}
+        cursor = {LAB: logs[LAB].last_sequence}
         streams = [feed.follow(logs, cursor, admitted, lambda _: begun, whole) for whole in 5 * [None, set[str]()]]
         for stream in streams:
             assert [(await anext(stream))[:6] for _ in range(2)] == ["retry:", "event:"]
@@ -317,7 +317,7 @@ def test_cursors_are_parsed_as_written_and_invalid_ones_refused() -> None:
 def test_a_stalled_reader_does_not_hold_up_others(shared: Runtime) -> None:
     """It is left with a full pipe, while another reader gets everything."""
     lab, _ = shared.machines()
-    first = lab.history.last_sequence()
+    first = lab.history.last_sequence
     with (
         client(shared) as http,
         http.stream("GET", f"{EVENTS}?machine={LAB}&from=beginning") as stuck,
@@ -426,6 +426,6 @@ def test_a_stream_waits_while_the_history_cannot_be_read(shared: Runtime, monkey
         assert found.detail == "the history cannot be used: the disk is gone"
         monkeypatch.setattr(lab.history, "events", read)
         assert [one.data.sequence for one in reader.alarms(2)] == [
-            lab.history.last_sequence() - 1,
-            lab.history.last_sequence(),
+            lab.history.last_sequence - 1,
+            lab.history.last_sequence,
         ]

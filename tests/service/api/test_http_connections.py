@@ -97,7 +97,7 @@ def test_connections_with_endless_request_heads_are_closed() -> None:
 def test_connections_with_endless_request_bodies_are_closed(access: AccessSettings) -> None:
     with monitor(access, body_timeout_s=0.5) as runtime, connections(runtime.http_url, 20, SHELVE) as waiting:
         until(lambda: trickle(waiting), "end of all slow bodies")
-        assert runtime.machines()[0].history.last_sequence() == -1
+        assert runtime.machines()[0].history.last_sequence == -1
 
 
 def test_streams_and_regular_callers_stay_connected() -> None:

@@ -90,7 +90,7 @@ def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
             feed.put_good()
             feed.put_good()
             until(lambda: worker.health().quality.accepted_blocks == 14, "the last block")
-            until(lambda: worker.history.last_sequence() >= 0, "the alarm on the gap")
+            until(lambda: worker.history.last_sequence >= 0, "the alarm on the gap")
             until(lambda: runtime.webhooks.statuses().webhooks[0].delivered == 1, "delivery")
             scraped(runtime, token(runtime, Scope.READ, name="before"))  # which is a request itself
             yield runtime, token(runtime, Scope.READ), scraped(runtime, token(runtime, Scope.READ, name="first"))
@@ -237,7 +237,7 @@ def test_counters_start_at_0_after_a_restart_and_alarms_are_restored(tmp_path: P
     plan = settings(endpoint(), machine_file(tmp_path, IN_ORDER), when_full="wait", history=kept_in(tmp_path))
     with feeding(plan) as (runtime, feed):
         feed.gap()
-        until(lambda: runtime.machines()[0].history.last_sequence() == 0, "the alarm on the gap")
+        until(lambda: runtime.machines()[0].history.last_sequence == 0, "the alarm on the gap")
         until(lambda: parsed(runtime.metrics.text().decode()).of_lab("alarm_events_total", kind="raised") == 1, "count")
         assert parsed(runtime.metrics.text().decode()).of_lab("restored_at_start") == 0.0
     with running(plan) as runtime:
@@ -246,7 +246,7 @@ def test_counters_start_at_0_after_a_restart_and_alarms_are_restored(tmp_path: P
         assert read.of_lab("alarm_events_total", kind="raised") == 0.0
         assert read.of_lab("alarms", state="unacknowledged", severity="alert") == 1.0
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(runtime.machines()[0].history, "_last_sequence", 5)  # more than can be read
+            patch.setattr(runtime.machines()[0].history, "last_sequence", 5)  # more than can be read
             patch.setattr(type(runtime.machines()[0].history), "events", failing)
             assert parsed(runtime.metrics.text().decode()).of_lab("alarm_events_total", kind="raised") == 0.0
 

@@ -37,7 +37,7 @@ class Plant:
     def happen(self, *events: StoredEvent, place: str = "demo/lab") -> None:
         for event in events:
             self.logs[place].commit(Step(events=(event,)))
-            until(lambda: self.logs[place].waiting == 0, "event in the history")
+            until(lambda: self.logs[place].claim.steps == 0, "event in the history")
 
 
 @contextmanager

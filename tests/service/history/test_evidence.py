@@ -99,7 +99,7 @@ def test_a_new_history_gets_the_evidence_once_the_change_has_settled() -> None:
     worker = Mock()
     worker.history.evidence.side_effect = lambda name, occurrence=0: kept.get((name, occurrence))
     worker.history.keep_evidence.side_effect = lambda name, occurrence, text: kept.update({(name, occurrence): text})
-    worker.history.generation = 0
+    worker.history.claim.generation = 0
     collector, picture = EvidenceCollector(worker), Picture.model_validate(example(Picture))
     alarming = Health.model_validate(example(Health))
     report, (alarm, *_) = sure(alarming.report), alarming.alarms
@@ -115,7 +115,7 @@ def test_a_new_history_gets_the_evidence_once_the_change_has_settled() -> None:
     look(10, calm=True)
     look(20)
     kept.clear()
-    worker.history.generation = 1
+    worker.history.claim.generation = 1
     look(30)
     assert kept == {}
     look(40, settled=True)

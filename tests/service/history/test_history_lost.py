@@ -82,12 +82,13 @@ def test_a_deleted_or_moved_history_is_written_again_in_full(tmp_path: Path, mov
         else:
             history_of(folder).unlink()
         assert "the file was deleted" in at.store.unreachable()
-        until(lambda: history_of(folder).exists() and at.store.unreachable() == at.store.trouble == "", "a new file")
+        writer = at.store.writer
+        until(lambda: history_of(folder).exists() and at.store.unreachable() == writer.trouble == "", "a new file")
         until(lambda: ticked(at) and len(at.log()) > len(before), "the alarm")
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 15)))
         log = at.log()
         assert log[: len(before) + 1] == [*before, (len(before), "raised", FAULT)]
-        assert (at.store.lost, at.history.waiting) == ("", 0)
+        assert (at.store.database.lost, at.history.claim.steps) == ("", 0)
     assert in_file(folder, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
     assert in_file(folder, "SELECT token_id FROM tokens") == [("aaaa",)]
     assert in_file(folder, "SELECT count(*) FROM audit_log") == [(1,)]
@@ -106,13 +107,13 @@ def test_a_replaced_history_continues_the_alarm_sequence_numbers(tmp_path: Path,
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
-        last = at.history.last_sequence()
+        last = at.history.last_sequence
         state = in_file(tmp_path, "SELECT count(*) FROM checkpoints")
         assert last >= 0
         other.rename(history_of(tmp_path))
-        until(lambda: at.store.lost != "", "the notice")
-        until(lambda: ticked(at) and at.history.last_sequence() > last, "the alarm")
-        until(lambda: at.history.waiting == 0, "the state in the new file")
+        until(lambda: at.store.database.lost != "", "the notice")
+        until(lambda: ticked(at) and at.history.last_sequence > last, "the alarm")
+        until(lambda: at.history.claim.steps == 0, "the state in the new file")
         assert at.log() == [(last + 1, "raised", FAULT)]
         assert in_file(tmp_path, "SELECT count(*) FROM checkpoints") == state == [(1,)]
         # No other monitor can take the machine meanwhile.
@@ -131,11 +132,11 @@ def test_a_replaced_history_continues_the_alarm_sequence_numbers(tmp_path: Path,
 def test_sequence_numbers_continue_when_the_file_has_lost_its_alarm_events(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
-        last = at.history.last_sequence()
+        last = at.history.last_sequence
     for statement in ("DROP TRIGGER alarm_events_no_delete", "DELETE FROM alarm_events"):
         in_file(tmp_path, statement)
     with bench(tmp_path) as at:
-        assert at.history.last_sequence() == last
+        assert at.history.last_sequence == last
         at.put(block(90, run=3, sequence=0))
         assert at.log()[0][0] == last + 1
 

@@ -93,7 +93,7 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
 
     with opened(url) as again:
         lab = again.machine("demo", "lab")
-        assert (lab.last_sequence(), lab.events()) == (5, tuple(step.events[0] for step in steps))
+        assert (lab.last_sequence, lab.events()) == (5, tuple(step.events[0] for step in steps))
         assert [report for _, report in lab.reports()] == [step.reports[0] for step in reversed(steps)]
         for place, (quantity, name) in enumerate((("parameter", "k_by"), ("parameter", "e"), ("misfit", "z"))):
             found = [(one.end_ns, one.value, one.standard_error) for one in lab.readings(quantity=quantity, name=name)]
@@ -106,11 +106,11 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
 def test_machines_do_not_see_each_other(store: Store) -> None:
     lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
     lab.commit(hop_step(0, events=(alarm_event(0),)))
-    assert (pump.last_sequence(), pump.restore(), pump.waiting) == (-1, None, 0)
+    assert (pump.last_sequence, pump.restore(), pump.claim.steps) == (-1, None, 0)
     found = pump.events(), pump.reports(), pump.readings(quantity="parameter", name="k_by")
     assert (*found, pump.downsampled(quantity="parameter")) == ((), (), (), ())
     pump.commit(Step(events=(alarm_event(0),)))  # the same id in another machine is another event
-    assert pump.last_sequence() == 0
+    assert pump.last_sequence == 0
 
 
 def test_a_checkpoint_holds_its_new_parts_and_those_to_keep(lab: MachineStore) -> None:
@@ -131,7 +131,7 @@ def test_a_step_written_twice_stores_its_events_once(lab: MachineStore) -> None:
     assert lab.commit(Step(events=events[:2]))
     assert lab.commit(Step(events=events))
     assert lab.commit(Step(events=events[1:2]))
-    assert (lab.events(), lab.last_sequence()) == (events, 2)
+    assert (lab.events(), lab.last_sequence) == (events, 2)
 
 
 def test_events_that_contradict_the_log_are_refused_with_their_step(lab: MachineStore) -> None:
@@ -144,7 +144,7 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
     ):
         with pytest.raises(StoreError, match=message):
             lab.commit(hop_step(1, events=events))
-        assert lab.last_sequence() == 1
+        assert lab.last_sequence == 1
     assert lab.reports() == ()
     assert lab.restore() is None
     assert lab.commit(hop_step(1, events=(alarm_event(2),)))
@@ -166,14 +166,14 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
 def test_values_no_database_can_store_are_refused_by_name(lab: MachineStore, step: Step, message: str) -> None:
     with pytest.raises(StoreError, match=rf"demo/lab-\d+: .*{message}"):
         lab.commit(step)
-    assert lab.waiting == 0
+    assert lab.claim.steps == 0
     assert lab.commit(hop_step(1, events=(alarm_event(0),)))
 
 
 def test_waiting_steps_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     machines = [store.machine("demo", f"m{number}") for number in range(12)]
     commits: list[int] = []
-    event.listen(store._database.engine, "commit", lambda connection: commits.append(1))
+    event.listen(store.database.engine, "commit", lambda connection: commits.append(1))
     ready = threading.Barrier(len(machines))
 
     def feed(machine: MachineStore) -> None:
@@ -191,7 +191,7 @@ def test_waiting_steps_are_committed_together(store: Store, monkeypatch: pytest.
 
 def test_readers_do_not_block_writers(store: Store) -> None:
     lab = store.machine("demo", "lab")
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         assert connection.scalar(text("SELECT count(*) FROM alarm_events")) == 0
         for number in range(3):
             assert lab.commit(hop_step(number, events=(alarm_event(number),)))
@@ -225,7 +225,7 @@ def test_only_one_monitor_can_write_a_machine(store: Store, url: str) -> None:
             other.machine("demo", "lab")
         other.machine("demo", "pump").commit(Step(events=(alarm_event(0),)))
         store.close()
-        assert other.machine("demo", "lab").last_sequence() == 0
+        assert other.machine("demo", "lab").last_sequence == 0
 
 
 @pytest.mark.parametrize("url", ["postgresql"], indirect=True)
@@ -234,7 +234,7 @@ def test_a_new_monitor_waits_until_the_server_releases_the_old_lock(store: Store
     with opened(url) as other:
         ending = threading.Timer(0.3, store.close)
         ending.start()
-        assert other.machine("demo", "lab").last_sequence() == 0
+        assert other.machine("demo", "lab").last_sequence == 0
         ending.join()
 
 
@@ -246,7 +246,7 @@ def test_a_replaced_monitor_can_no_longer_write(store: Store, url: str) -> None:
         with pytest.raises(StoreError, match="another monitor has taken over the history of demo/lab"):
             lab.commit(hop_step(1, events=(alarm_event(0),)))
     assert len(lab.reports()) == 1
-    assert store.trouble == ""
+    assert store.writer.trouble == ""
 
 
 AUDIT: dict[str, Any] = {
@@ -349,7 +349,7 @@ def test_an_unreachable_server_is_named_without_its_password(tmp_path: Path) -> 
     with pytest.raises(StoreError, match=r"postgresql://anna:\*\*\*@/db") as caught:
         store.open()
     assert "secret" not in str(caught.value)
-    assert "secret" not in store.shown
+    assert "secret" not in store.database.shown
     store.close()
 
 
@@ -374,7 +374,7 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
     with opened(f"sqlite:///{file}") as store:
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size", "wal_autocheckpoint")
-        with store._database.reading() as reader:
+        with store.database.reading() as reader:
             found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
         assert found == ["wal", 2, 1, 5000, 512, 32000]
     assert executed(f"sqlite:///{file}", "PRAGMA integrity_check") == [("ok",)]
@@ -392,7 +392,7 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             safe = int(writer.output().rsplit("\n", 2)[-2])
         with opened(url) as store:
             lab = store.machine("demo", "lab")
-            last = lab.last_sequence()
+            last = lab.last_sequence
             steps = (last + 1) // 2
             assert last % 2 == 1  # both events of a step or none
             assert steps - 2 <= safe < steps  # all steps printed as durable, and at most one more
@@ -409,7 +409,7 @@ def write_for_ever(url: str) -> None:
     """Continue from what is there and print what has become durable; run by the test of a killed writer."""
     with opened(url) as store:
         lab = store.machine("demo", "lab")
-        for number in count(lab.last_sequence() // 2 + 1):
+        for number in count(lab.last_sequence // 2 + 1):
             assert lab.commit(hop_step(number, events=(alarm_event(2 * number), alarm_event(2 * number + 1))))
             print(number, flush=True)  # noqa: T201  # to the test
 

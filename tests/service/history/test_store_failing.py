@@ -62,7 +62,7 @@ opened = partial(history_opened, timeout_s=QUICK_S, retry_s=0.05)
 def written(machine: MachineStore, step: Step) -> None:
     """Commit a step; on a busy computer the first try may take longer than this store waits."""
     machine.commit(step)
-    until(lambda: machine.waiting == 0, "step in the database")
+    until(lambda: machine.claim.steps == 0, "step in the database")
 
 
 def test_nothing_is_lost_while_the_database_is_unreachable(parts: Parts) -> None:
@@ -71,19 +71,19 @@ def test_nothing_is_lost_while_the_database_is_unreachable(parts: Parts) -> None
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
         for number in range(3):
             written(lab, hop_step(number, events=(alarm_event(number),)))
-        assert store.unreachable() == store.trouble == ""
+        assert store.unreachable() == store.writer.trouble == ""
         fail()
         assert store.unreachable() != ""  # it shows before anything is written
-        assert store.trouble == ""
+        assert store.writer.trouble == ""
         for number in range(3, 40):
             assert not lab.commit(hop_step(number, events=(alarm_event(number),)))
             assert not pump.commit(hop_step(number, events=(alarm_event(number - 3),)))
-        assert store.trouble != ""
-        assert (lab.waiting, lab.last_sequence()) == (37, 39)
+        assert store.writer.trouble != ""
+        assert (lab.claim.steps, lab.last_sequence) == (37, 39)
         mend()
-        until(lambda: lab.waiting == pump.waiting == 0, "recovery")
+        until(lambda: lab.claim.steps == pump.claim.steps == 0, "recovery")
         until(lambda: store.unreachable() == "", "answer of the database")
-        assert store.trouble == ""
+        assert store.writer.trouble == ""
         with opened(url) as other, pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
             other.machine("demo", "lab")  # its locks are taken again
         written(lab, hop_step(40, events=(alarm_event(40),)))
@@ -105,7 +105,7 @@ def test_waiting_reports_are_bounded_and_events_are_never_dropped(parts: Parts) 
         for number in range(1, 60):
             assert not lab.commit(hop_step(number, events=(alarm_event(number),)))
         mend()
-        until(lambda: lab.waiting == 0, "recovery")
+        until(lambda: lab.claim.steps == 0, "recovery")
         assert [event.sequence for event in lab.events()] == list(range(60))
         # The step that was tried first is kept as it was; then the newest five.
         assert [report.text for _, report in lab.reports()] == [
@@ -126,7 +126,7 @@ def test_waiting_steps_are_written_on_close(parts: Parts) -> None:
         assert not lab.commit(Step(events=(alarm_event(1),)))
         mend()
     with opened(url) as store:
-        assert store.machine("demo", "lab").last_sequence() == 1
+        assert store.machine("demo", "lab").last_sequence == 1
 
 
 def test_a_failing_step_of_one_machine_does_not_hold_up_the_others(tmp_path: Path) -> None:
@@ -137,15 +137,15 @@ def test_a_failing_step_of_one_machine_does_not_hold_up_the_others(tmp_path: Pat
         executed(url, "UPDATE machines SET reports = 'many' WHERE name = 'lab'")
         assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
         pump.commit(hop_step(0, events=(alarm_event(0),)))
-        until(lambda: pump.waiting == 0, "the other machine's step")
+        until(lambda: pump.claim.steps == 0, "the other machine's step")
         assert len(pump.events()) == 1
-        assert store.trouble == ""  # the database works
-        assert (lab.waiting, lab.trouble != "", pump.trouble) == (1, True, "")
+        assert store.writer.trouble == ""  # the database works
+        assert (lab.claim.steps, lab.claim.trouble != "", pump.claim.trouble) == (1, True, "")
         assert pump.commit(hop_step(1, events=(alarm_event(1),)))  # at once, whatever becomes of the other
         assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
         executed(url, "UPDATE machines SET reports = 0 WHERE name = 'lab'")
-        until(lambda: lab.waiting == 0, "the step")
-        assert lab.trouble == ""
+        until(lambda: lab.claim.steps == 0, "the step")
+        assert lab.claim.trouble == ""
         assert len(lab.events()) == len(lab.reports()) == 2
 
 
@@ -202,7 +202,7 @@ def test_a_step_whose_commit_reply_was_lost_is_stored_once(server: PostgresServe
             if number % 3 == 1:
                 proxy.armed.set()
             lab.commit(hop_step(number, events=(alarm_event(number),)))
-            until(lambda: lab.waiting == 0, "the step")
+            until(lambda: lab.claim.steps == 0, "the step")
         assert proxy.swallowed == 7
         assert [event.sequence for event in lab.events()] == list(range(20))
         assert [report.text for _, report in lab.reports()] == [f'{{"number": {n}}}' for n in range(19, -1, -1)]
@@ -212,7 +212,7 @@ def test_a_step_whose_commit_reply_was_lost_is_stored_once(server: PostgresServe
 @contextmanager
 def hanging(store: Store) -> Iterator[None]:
     """Suspend the server's process for the writer's connection."""
-    ((pid,),) = store._database.rows(
+    ((pid,),) = store.database.rows(
         select(text("pid")).select_from(text("pg_locks")).where(text("locktype = 'advisory' AND objid = 1"))
     )
     os.kill(pid, signal.SIGSTOP)
@@ -238,7 +238,7 @@ def test_the_writer_uses_another_connection_when_the_server_hangs(server: Postgr
         written(lab, hop_step(0, events=(alarm_event(0),)))
         with hanging(store):
             assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
-            until(lambda: lab.waiting == 0, "the step over another connection")
+            until(lambda: lab.claim.steps == 0, "the step over another connection")
             assert len(lab.events()) == 2
 
 
@@ -307,13 +307,13 @@ def test_close_does_not_wait_for_a_hung_server(server: PostgresServer) -> None:
 def test_commits_return_while_the_disk_hangs_and_are_written_later(tmp_path: Path) -> None:
     with opened(f"sqlite:///{tmp_path}/history.sqlite") as store:
         lab = store.machine("demo", "lab")
-        with store._writer._turn:  # the writer's thread comes no further than this
+        with store.writer._turn:  # the writer's thread comes no further than this
             assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
-            assert "no answer in time" in store.trouble
+            assert "no answer in time" in store.writer.trouble
             assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
-            assert lab.waiting == 2
-        until(lambda: lab.waiting == 0, "recovery")
-        assert store.trouble == ""
+            assert lab.claim.steps == 2
+        until(lambda: lab.claim.steps == 0, "recovery")
+        assert store.writer.trouble == ""
         assert [event.sequence for event in lab.events()] == [0, 1]
         written(lab, hop_step(2))
 

@@ -155,7 +155,7 @@ def test_reduced_and_remaining_readings_form_one_trend(store: Store, clock: Cloc
 
 
 def test_a_trend_of_many_windows_uses_buckets(store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.history.trend._SINGLE", 100)
+    monkeypatch.setattr("service.history.windows._SINGLE", 100)
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
     bounds = (None, int(written.ends[137])), (int(written.ends[137]), int(written.ends[1301])), (None, None)
@@ -253,7 +253,7 @@ def test_invalid_retention_settings_are_refused(fields: dict[str, float]) -> Non
 
 def test_status_states_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
     lab, idle = store.machine("demo", "lab"), store.machine("demo", "idle")
-    assert idle.last_sequence() == -1
+    assert idle.last_sequence == -1
     empty = store.status()
     assert [one.machine for one in empty.machines] == ["idle", "lab"]
     assert all(one.oldest_reading_ns is None for one in empty.machines)

@@ -33,7 +33,7 @@ def commit(lab: MachineStore, *times_s: float, value: float = 1.0) -> None:
 
 def stored(store: Store) -> tuple[list[int], int]:
     """Starts of the buckets there are, in buckets since the first, and up to which window readings are in them."""
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         starts = connection.scalars(buckets.select().with_only_columns(buckets.c.start_ns).order_by(buckets.c.start_ns))
         numbers = connection.scalars(machines.select().with_only_columns(machines.c.bucketed))
         return [(start - T0) // BUCKET for start in starts], numbers.one()
@@ -62,7 +62,7 @@ def test_readings_are_summed_by_place_and_series(first: int) -> None:
 
 
 def test_windows_are_added_to_a_bucket_when_the_next_one_begins(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.history.trend._SINGLE", 0)
+    monkeypatch.setattr("service.history.windows._SINGLE", 0)
     lab = store.machine("demo", "lab")
     commit(lab, 10)
     commit(lab, 20)
@@ -98,7 +98,7 @@ def test_a_trend_begins_with_the_first_reading_and_ends_with_the_newest_window(s
 
 
 def test_a_coarse_query_over_many_windows_uses_buckets(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 100)
+    monkeypatch.setattr("service.history.windows._SINGLE_FOR_COARSE", 100)
     lab = store.machine("demo", "lab")
     commit(lab, *range(0, 7200, 60))
     commit(lab, 7260)
@@ -108,12 +108,12 @@ def test_a_coarse_query_over_many_windows_uses_buckets(store: Store, monkeypatch
     }
     assert lengths == {6: {1800}, 24: {600}, 25: {290}}
     assert [sum(counts(lab, points)) for points in (6, 24, 25)] == [121] * 3
-    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 121)
+    monkeypatch.setattr("service.history.windows._SINGLE_FOR_COARSE", 121)
     assert lab.downsampled(quantity="parameter", names=["e"], points=24)[0].length_ns == 7260 * NS // 24 + 1
 
 
 def test_readings_count_once_when_the_bucket_length_changes(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.history.trend._SINGLE", 0)
+    monkeypatch.setattr("service.history.windows._SINGLE", 0)
     for number, bucket_s in enumerate((600, 60, 600)):
         with opened(url, Retention(bucket_s=bucket_s)) as store:
             lab = store.machine("demo", "lab")

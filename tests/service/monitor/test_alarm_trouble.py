@@ -189,7 +189,7 @@ def test_events_refused_by_the_history_are_written_later(tmp_path: Path, monkeyp
         assert [len(at.outlet.events), at.worker.errors] == [4, 2]
         # The trouble is of this machine: the history of others works.
         assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
-        assert ("refused" in at.worker.trouble, at.store.trouble) == (True, "")
+        assert ("refused" in at.worker.trouble, at.store.writer.trouble) == (True, "")
         refusing.clear()
         at.worker.operate(order("acknowledge", GAP))
         assert at.worker.trouble == ""

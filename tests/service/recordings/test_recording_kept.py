@@ -266,7 +266,7 @@ def test_a_monitor_keeps_recordings_only_for_its_own_alarms(tmp_path: Path) -> N
 
         def raised() -> bool:
             feed.put_good()
-            return worker.history.last_sequence() >= 0
+            return worker.history.last_sequence >= 0
 
         until(raised, "an alarm of the monitor's own")
     kept = kept_reasons(folder)

@@ -349,7 +349,7 @@ def test_forged_messages_in_the_monitors_name_do_not_enter_its_history(tmp_path:
             session.put(key, forged)
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 2, "what came after the forgeries")
-        until(lambda: worker.history.last_sequence() == 0, "an alarm of the monitor's own")
+        until(lambda: worker.history.last_sequence == 0, "an alarm of the monitor's own")
         with client(runtime) as http:
             (event,) = http.get(f"{PLACE}/alarms/events").json()["events"]
             health = http.get(f"{PLACE}/health").json()
