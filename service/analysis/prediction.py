@@ -231,16 +231,11 @@ class Prediction:
     """Theory for one window."""
 
     machine: Machine | None  # as nominal
-    excitation: Excitation | None
+    excitation: Excitation | None  # None if there is a `nominal_reason`
     changes: dict[str, float]  # relative changes of the machine as estimated
     # Why there is no prediction for the nominal or the estimated machine; empty if there is one.
     nominal_reason: str
     estimated_reason: str
-
-    def rotors(self, known: Machine) -> tuple[RotorParameters | None, RotorParameters | None]:
-        """The nominal rotor and that as estimated, each None if there is no prediction for it."""
-        estimated = None if self.estimated_reason else changed(known.rotor, self.changes)
-        return None if self.nominal_reason else known.rotor, estimated
 
     def spectra(
         self, states: tuple[str, ...], frequencies_hz: FloatArray
@@ -249,20 +244,19 @@ class Prediction:
 
         The frequencies are lines of the window's spectrum, evenly spaced; the shape is (n_lines, n, n).
         """
-        if self.excitation is None or self.machine is None:
+        known, excitation = self.machine, self.excitation
+        if known is None or excitation is None:
             return None, None
         spacing_hz = float(frequencies_hz[1] - frequencies_hz[0])
         none_left_out = np.zeros(frequencies_hz.size, dtype=np.bool_)
-        lines = group_bins(frequencies_hz, self.machine, none_left_out, spacing_hz)
+        lines = group_bins(frequencies_hz, known, none_left_out, spacing_hz)
         nodes, place = np.unique(np.round(lines.nodes_hz / spacing_hz, 6), return_inverse=True)
-        found: list[ComplexArray | None] = []
-        for rotor in self.rotors(self.machine):
-            if rotor is None:
-                found.append(None)
-                continue
-            at_nodes = self.excitation.spectra(rotor, states, nodes * spacing_hz)[place.reshape(lines.nodes_hz.shape)]
-            found.append(np.asarray(np.einsum("lk,lkij->lij", lines.weights, at_nodes), dtype=np.complex128))
-        return found[0], found[1]
+
+        def of(rotor: RotorParameters) -> ComplexArray:
+            at_nodes = excitation.spectra(rotor, states, nodes * spacing_hz)[place.reshape(lines.nodes_hz.shape)]
+            return np.asarray(np.einsum("lk,lkij->lij", lines.weights, at_nodes), dtype=np.complex128)
+
+        return of(known.rotor), None if self.estimated_reason else of(changed(known.rotor, self.changes))
 
     def correlations(
         self,
@@ -275,20 +269,19 @@ class Prediction:
 
         `pairs` are indices into `states`, reference and response; `within_hz` limits the integral to a band.
         """
-        if self.excitation is None or self.machine is None:
+        known, excitation = self.machine, self.excitation
+        if known is None or excitation is None:
             return None, None
-        low_hz, high_hz = within_hz or (0.0, _highest_hz(self.machine, states))
-        found: list[FloatArray | None] = []
-        for rotor in self.rotors(self.machine):
-            if rotor is None:
-                found.append(None)
-                continue
-            frequencies_hz, weights = _nodes(self.excitation, rotor, low_hz, high_hz, float(lags_s[-1]))
-            spectra = self.excitation.spectra(rotor, states, frequencies_hz)
+        low_hz, high_hz = within_hz or (0.0, _highest_hz(known, states))
+
+        def of(rotor: RotorParameters) -> FloatArray:
+            frequencies_hz, weights = _nodes(excitation, rotor, low_hz, high_hz, float(lags_s[-1]))
+            spectra = excitation.spectra(rotor, states, frequencies_hz)
             of_pairs = np.stack([spectra[:, i, j] for i, j in pairs], axis=1) * weights[:, None]
             phase = 2 * np.pi * np.outer(lags_s, frequencies_hz)
-            found.append(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag))
-        return found[0], found[1]
+            return np.asarray(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag))
+
+        return of(known.rotor), None if self.estimated_reason else of(changed(known.rotor, self.changes))
 
 
 def _highest_hz(machine: Machine, states: tuple[str, ...]) -> float:

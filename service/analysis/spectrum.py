@@ -197,9 +197,8 @@ def _used(data: Sampled, channels: Sequence[Channel], window_s: float, segment: 
             f"{data.place}: a spectrum with --resolution {1 / needed_s:g} Hz needs {needed_s:g} s without a gap, the "
             f"longest stretch of {data.name} in the last {window_s:g} s is {longest_s:.3g} s"
         )
-    lengths = np.array([stretch.length_s for stretch in used])
-    speeds = np.array([stretch.speed_rad_s for stretch in used])
-    return used, float(np.sum(speeds * lengths) / np.sum(lengths))
+    lengths_s = [stretch.length_s for stretch in used]
+    return used, float(np.average([stretch.speed_rad_s for stretch in used], weights=lengths_s))
 
 
 def read_full_spectrum(

@@ -1,10 +1,12 @@
 """Selection of a snapshot's channels: those requested by name, or a default choice; units and rounding of values."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.window.moments import ComplexArray
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.block import FloatArray
@@ -15,6 +17,7 @@ MOST_PAIRS = 8
 """Most pairs in a snapshot if none is requested."""
 _MOST_CHANNELS = 64
 _DIGITS = 6
+_Array = TypeVar("_Array", FloatArray, ComplexArray)
 
 
 class SnapshotError(RotorwatchError):
@@ -138,6 +141,14 @@ def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
     up, down = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
     rounded = np.where(array == 0, 0.0, np.round(solid * up / down) * down / up)
     return tuple(value if known else None for value, known in zip(rounded.tolist(), finite.tolist(), strict=True))
+
+
+def averaged(values: _Array, group: int) -> _Array:
+    """Means of `group` adjacent values along the first axis; an incomplete last group is dropped."""
+    if group == 1:
+        return values
+    whole = values[: values.shape[0] // group * group]
+    return np.asarray(whole.reshape(-1, group, *values.shape[1:]).mean(axis=1), dtype=values.dtype)
 
 
 def known_figures(values: npt.ArrayLike) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ The modules that compute snapshots are imported at the first request, so a proce
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -78,13 +78,11 @@ class LatestData:
         return None if self.window is None else self.window.end_ns, self.parameters, self.filled, self.why_not
 
 
-def heading(
-    subject: Subject, data: LatestData, changes: Mapping[str, float], nominal_reason: str, estimated_reason: str
-) -> dict[str, Any]:
+def heading(subject: Subject, data: LatestData, prediction: "Prediction") -> dict[str, Any]:
     """Fields of every snapshot: the machine, its window and speed, and the parameter changes that theory assumes."""
     window = data.window
     speed = np.nan if window is None or "theta" in data.lost else window.speed_rad_s
-    shown = {} if estimated_reason else changes
+    shown = {} if prediction.estimated_reason else prediction.changes
     return {
         **subject.identity,
         "start_ns": None if window is None else window.start_ns,
@@ -95,8 +93,8 @@ def heading(
             changes=tuple(
                 PredictedChange(name=name, relative_change=float(f"{value:.6g}")) for name, value in shown.items()
             ),
-            nominal_reason=nominal_reason,
-            estimated_reason=estimated_reason,
+            nominal_reason=prediction.nominal_reason,
+            estimated_reason=prediction.estimated_reason,
         ),
     }
 

@@ -13,7 +13,7 @@ from models.signals.block import ComplexArray, SampleBlock
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
-from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
+from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, Prediction, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
 from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
@@ -64,7 +64,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         predicted[1] = None if estimated_reason else _predicted(known, changed(known.rotor, changes), window)
     others = [(pair, _path(machine, path, pair, units)) for pair in pairs if pair not in places]
     return OrbitSnapshot(
-        **heading(subject, data, changes, lacking, estimated_reason),
+        **heading(subject, data, Prediction(known, None, changes, lacking, estimated_reason)),
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
             _window_orbit(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places

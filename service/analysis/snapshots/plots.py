@@ -25,7 +25,7 @@ from service.analysis.past import Past
 from service.analysis.recorded import Recorded, Sampled
 from service.analysis.revolutions import Excerpt, newest_revolutions
 from service.analysis.runup import read_centreline, read_run_up
-from service.analysis.snapshots.channels import figures, known_figures
+from service.analysis.snapshots.channels import averaged, figures, known_figures
 from service.analysis.spectrum import lowest_hz, read_full_spectrum, read_waterfall, shown_as, steady, unit_shown
 
 _MOST_SAMPLES = 20_000
@@ -84,7 +84,7 @@ def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
         start_ns=found.start_ns,
         end_ns=found.end_ns,
         speed_rad_s=figures([found.speed_rad_s])[0],
-        frequencies_hz=known_figures(_grouped(found.lines[lines], group).mean(axis=-1)),
+        frequencies_hz=known_figures(averaged(found.lines[lines], group)),
         resolution_hz=found.resolution * group,
         averages=found.averages,
         places=tuple(
@@ -133,7 +133,7 @@ def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "s
         channel=channel.name,
         unit=shown_as(channel, "amplitude")[0],
         over=over,
-        frequencies_hz=known_figures(_grouped(found.frequencies_hz[lines], group).mean(axis=-1)),
+        frequencies_hz=known_figures(averaged(found.frequencies_hz[lines], group)),
         resolution_hz=found.resolution_hz * group,
         rows=tuple(
             WaterfallRow(
@@ -217,10 +217,6 @@ def _newest(excerpt: Excerpt) -> Excerpt:
     return excerpt.part(max(0, size - min(_MOST_SAMPLES, round(_WITHOUT_SPEED_S * excerpt.rate_hz))), size)
 
 
-def _grouped(values: FloatArray, group: int) -> FloatArray:
-    """Groups of adjacent values, shape (n_groups, group); an incomplete last group is dropped."""
-    return values[: values.size // group * group].reshape(-1, group)
-
-
 def _highest(values: FloatArray, group: int) -> FloatArray:
-    return np.asarray(_grouped(values, group).max(axis=-1), dtype=np.float64)
+    """Maxima of groups of adjacent values, of those that `averaged` gives the means."""
+    return np.asarray(values[: values.size // group * group].reshape(-1, group).max(axis=-1), dtype=np.float64)

@@ -1,7 +1,6 @@
 """Correlation functions and power spectral densities of the latest window, with theory, and coherence of pairs."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 from scipy.special import chdtri
@@ -21,6 +20,7 @@ from service.analysis.correlation import MeasuredCorrelations, measured_correlat
 from service.analysis.prediction import LEFT_OUT_BINS, Prediction
 from service.analysis.snapshots.channels import (
     SnapshotError,
+    averaged,
     check_held,
     chosen_channels,
     chosen_pairs,
@@ -36,7 +36,7 @@ _MOST_LINES = 1000
 _SEGMENT_CORRELATIONS = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
 """Sums of squared correlations of half-overlapping Hann segments' power: in one line, and in lines 1 and 2 apart."""
 _OUTER = (0.025, 0.975)
-_Array = TypeVar("_Array", FloatArray, ComplexArray)
+
 _Spectra = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
 """Two-sided cross-spectra, SI²/Hz: measured, nominal, estimated; shape (n_lines, n, n), in the same order of states."""
 
@@ -52,7 +52,7 @@ def correlation_snapshot(
     """Correlation functions of pairs of channels, see `chosen_pairs`, with standard errors and predictions."""
     machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     pairs = chosen_pairs(machine, first, second)
-    head = heading(subject, data, prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
+    head = heading(subject, data, prediction)
     if window is not None and not (first or second):
         pairs = tuple(pair for pair in pairs if all(state_name(one) in window.states for one in pair))
     if window is None or not pairs:
@@ -147,7 +147,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     chosen = chosen_channels(machine, channels)
     pairs = chosen_pairs(machine, first, second) if first or second else ()
     within = _checked(machine, band_hz)
-    head = heading(subject, data, prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
+    head = heading(subject, data, prediction)
     if window is not None and not channels:
         chosen = tuple(channel for channel in chosen if state_name(channel) in window.states)
     used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))
@@ -175,10 +175,10 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     group = -(-frequencies_hz.size // _MOST_LINES)
     of_theory, parts = seen_by(used)
     nominal, estimated = (
-        one if one is None else _grouped(one if parts is None else np.asarray(parts @ one @ parts.T), group)
+        one if one is None else averaged(one if parts is None else np.asarray(parts @ one @ parts.T), group)
         for one in prediction.spectra(of_theory, frequencies_hz)
     )
-    measured = _grouped(window.spectrum[lines][:, columns][:, :, columns], group)
+    measured = averaged(window.spectrum[lines][:, columns][:, :, columns], group)
     gone = np.isin(states, list(data.lost))
     measured[:, gone[:, None] | gone] = np.nan
     spectra = measured, nominal, estimated
@@ -190,7 +190,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # options of the request
     low, high = (float(freedom / chdtri(freedom, 1 - part)) for part in reversed(_OUTER))
     return SpectrumSnapshot(
         **head,
-        frequencies_hz=known_figures(_grouped(frequencies_hz, group)),
+        frequencies_hz=known_figures(averaged(frequencies_hz, group)),
         line_spacing_hz=spacing_hz * group,
         averaged_lines=group,
         degrees_of_freedom=float(freedom),
@@ -222,14 +222,6 @@ def _checked(machine: MachineFile, band_hz: tuple[float, float] | None) -> tuple
             f"{2 / machine.window.segment_s:g} Hz within {there[0]:g} to {there[1]:g} Hz"
         )
     return low_hz, high_hz
-
-
-def _grouped(values: _Array, group: int) -> _Array:
-    """Means of `group` adjacent values along the first axis; an incomplete last group is dropped."""
-    if group == 1:
-        return values
-    whole = values[: values.shape[0] // group * group]
-    return np.asarray(whole.reshape(-1, group, *values.shape[1:]).mean(axis=1), dtype=values.dtype)
 
 
 def _averages(n_segments: int, group: int) -> float:
