@@ -13,6 +13,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from models.errors import MachineFileError, RecordingError
+from models.signals.recording import writing
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.interchange.source import Array
 
@@ -70,11 +71,10 @@ def _completed(out: Path) -> Iterator[Path]:
         raise RecordingError(f"{out}: is a device or pipe, expected the name of a file")
     part = out.with_name(out.name + ".part")
     try:
-        part.touch()  # fails early with a clear error, unlike the libraries, if the folder does not exist
-        yield part
-        part.replace(out)
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror or error})") from error
+        with writing(out):
+            part.touch()  # fails early with a clear error, unlike the libraries, if the folder does not exist
+            yield part
+            part.replace(out)
     finally:
         part.unlink(missing_ok=True)
 

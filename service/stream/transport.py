@@ -12,6 +12,7 @@ Callbacks run on Zenoh's threads. An exception in one is logged and counted here
 """
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -30,7 +31,6 @@ from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from models.signals.wire import REPLAY_MARK
 from service.stream.inbox import Intake, RawBlock
-from service.stream.log_query import read_log_query
 from service.stream.subscription import BlockSubscription
 from service.terminal.logs import logger
 
@@ -47,6 +47,10 @@ _DROP_AFTER_US = 1_000_000
 _CLOSE_AFTER_US = 2_000_000
 """How long a subscriber may hold up a link. With Zenoh's default of five seconds, the silence after which a stream is
 called lost, the streams of other machines would be called lost."""
+
+MOST_EVENTS = 1000
+_DEFAULT_EVENTS = 100
+_LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -384,6 +388,31 @@ def _answering_from_log(key: str, answer: Callable[[int, int], str]) -> Callable
                 query.reply(key, text, encoding=_JSON)
 
     return reply
+
+
+def read_log_query(parameters: str) -> tuple[int, int]:
+    """Read a query for an alarm log, ``after=17;limit=500``: after which sequence number, and at most how many events.
+
+    `parameters` is the text behind the question mark; names that begin with an underscore are Zenoh's own. Raises
+    `RotorwatchError`, naming what was found and what was expected.
+
+    Examples
+    --------
+    >>> read_log_query("after=17")
+    (17, 100)
+    """
+    found = {"after": -1, "limit": _DEFAULT_EVENTS}
+    for part in filter(None, parameters.split(";")):
+        name, _, value = part.partition("=")
+        if name.startswith("_"):
+            continue
+        if name not in found:
+            raise RotorwatchError(f"no parameter {name}, expected after or limit")
+        least, most = _LIMITS[name]
+        if not re.fullmatch(r"-?[0-9]{1,18}", value) or not least <= int(value) <= most:
+            raise RotorwatchError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+        found[name] = int(value)
+    return found["after"], found["limit"]
 
 
 def _explain(settings: LinkSettings, error: str) -> str:

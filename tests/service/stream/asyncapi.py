@@ -17,7 +17,7 @@ from rotorwatch import __version__
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
-from service.stream.log_query import MOST_EVENTS
+from service.stream.transport import MOST_EVENTS
 
 _JSON = "application/json"
 _DESCRIPTION = """Which parameter of a rotating machine changed, by how much, how sure: what a rotorwatch monitor
