@@ -58,9 +58,9 @@ class MachineMonitor:
     ) -> None:
         self.machine = machine = installed.machine
         self._skips = skips
-        self._alarms = AlarmBook(machine.alarms, by_angle="theta" in machine.descriptor.states)
-        self._data_path = DataPathAlarms(self._alarms, machine)
-        self._reporter = reporter = WindowReporter(installed, self._alarms, self._data_path, remembered=remembered)
+        self.alarms = AlarmBook(machine.alarms, by_angle="theta" in machine.descriptor.states)
+        self._data_path = DataPathAlarms(self.alarms, machine)
+        self._reporter = reporter = WindowReporter(installed, self.alarms, self._data_path, remembered=remembered)
         self.identity, self.watching = reporter.identity, reporter.watching
         self._window, self._levels, self._test = reporter.samples, reporter.levels, reporter.test
         self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
@@ -111,7 +111,7 @@ class MachineMonitor:
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} arrived in two versions; neither is used"
             verdict = Admission(Reason.CONFLICT, f"{self.machine.title}: {text}")
-            return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
+            return (MonitorReport(self._count(verdict), events=self.alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
         self._due.extend(self._arrivals.take(block, schema_hash))
@@ -192,7 +192,7 @@ class MachineMonitor:
             self._window.gap()
             self._note_defect(error, block.end_ns)
         fault, self._defect = self._defect, None
-        return MonitorReport(verdict, tuple(windows), self._alarms.take(), len(block.samples) / block.rate_hz, fault)
+        return MonitorReport(verdict, tuple(windows), self.alarms.take(), len(block.samples) / block.rate_hz, fault)
 
     def _feed_window(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Feed an accepted block to the window; return the ends of hops it completes, each to be evaluated in turn."""
@@ -205,11 +205,11 @@ class MachineMonitor:
             self._window.clear()
             self._kept_is_valid = False  # parts are named by the ends of hops, which may now recur
             self._test.clear()
-            self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
+            self.alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
         elif self.end_ns is None and self._reached_ns is not None:
             # Until now shelving ran on the time of day; from now on it runs on the time of the data.
-            self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
-        self._alarms.passed(block.start_ns)
+            self.alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
+        self.alarms.passed(block.start_ns)
         self._fault = self._data_path.accepted(verdict, block.start_ns, dropped) or self._fault
         self.end_ns = block.end_ns
         return self._window.feed(block.samples, block.start_ns)
@@ -217,7 +217,7 @@ class MachineMonitor:
     def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Raise the alarm on the monitor itself, at a data time; it clears once windows are evaluated again."""
         self._data_path.fault(what, time_ns)
-        return self._alarms.take()
+        return self.alarms.take()
 
     def _note_defect(self, error: Exception, time_ns: int) -> None:
         """Note a defect of the monitor: the machine is not evaluable until a window is evaluated again."""
@@ -228,9 +228,9 @@ class MachineMonitor:
     def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Take note of time that has passed, with data or without; `time_ns` estimates the data time reached by now."""
         self._reached_ns = time_ns
-        self._alarms.passed(time_ns)
+        self.alarms.passed(time_ns)
         self._data_path.passed(time_ns, self.end_ns)
-        return self._alarms.take()
+        return self.alarms.take()
 
     @property
     def window(self) -> Callable[[], WindowStatistics] | None:
@@ -247,20 +247,11 @@ class MachineMonitor:
         """The newest blocks without a gap between them, about 20 000 samples at most."""
         return self._newest.blocks
 
-    @property
-    def next_sequence(self) -> int:
-        """Number the next alarm event will have."""
-        return self._alarms.next_sequence
-
     def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for, see `AlarmBook.operate`."""
         self._reached_ns = time_ns
-        self._alarms.operate(operation, time_ns)
-        return self._alarms.take()
-
-    def take_events(self) -> tuple[AlarmEvent, ...]:
-        """Hand over alarm events that a defect has kept from being handed over."""
-        return self._alarms.take()
+        self.alarms.operate(operation, time_ns)
+        return self.alarms.take()
 
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
         """The state to restore from, without parts named in `kept`; with `whole` including the window, megabytes."""
@@ -274,7 +265,7 @@ class MachineMonitor:
         }
         state, new, names = divided(arrays, self._test.state.hops(), kept if self._kept_is_valid else ())
         self._kept_is_valid = True
-        return MonitorState(self._alarms.checkpoint(), state, new, names, self.end_ns)
+        return MonitorState(self.alarms.checkpoint(), state, new, names, self.end_ns)
 
     def restore(
         self, state: bytes, parts: Collection[bytes] = (), latest: Report | None = None, *, levels_alone: bool = False
@@ -310,7 +301,7 @@ class MachineMonitor:
 
         `end_ns` is the end of its newest data, on the alarms' clock, if nothing else of it was restored.
         """
-        self._alarms.restore(alarms, next_sequence)
+        self.alarms.restore(alarms, next_sequence)
         self.end_ns = end_ns if self.end_ns is None else self.end_ns
 
     def health(self) -> MachineHealth:
@@ -320,9 +311,9 @@ class MachineMonitor:
             self._reporter.state(calm),  # what operators did counts at once
             self._window.filled,
             self._latest,
-            self._alarms.alarms,
+            self.alarms.alarms,
             self._quality.model_copy(update={"accepted_blocks": self._accepted}),
-            self._alarms.next_sequence - 1,
+            self.alarms.next_sequence - 1,
             self._fault or ("" if self._latest is None else self._latest.reason),
             self.end_ns,
         )
@@ -368,5 +359,5 @@ class MachineMonitor:
             report, count = report.model_copy(update={"skipped": True}), self._quality.skipped_windows + 1
             self._quality = self._quality.model_copy(update={"skipped_windows": count})
         self._latest = report
-        self._alarms.suppress(None, end_ns)
+        self.alarms.suppress(None, end_ns)
         return report

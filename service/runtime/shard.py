@@ -78,7 +78,6 @@ class _Shard:
         self.refused = machines.refused
         self._told: dict[str, int] = {}
         self._looking = threading.Lock()
-        self._link: ShardLink | None = None
         machines.connect(undo)
         self._store.open()
         undo.callback(self._store.close)
@@ -99,8 +98,7 @@ class _Shard:
 
     def tell(self, place: str, *, changed: bool = False) -> None:
         """Send the state of a machine, with its health if that has changed."""
-        if self._link is not None:
-            self._link.tell(self._standing(place, changed=changed).model_dump_json().encode())
+        self._link.tell(self._standing(place, changed=changed).model_dump_json().encode())
 
     def _standing(self, place: str, *, changed: bool) -> Standing:
         worker = self.workers[place]

@@ -103,7 +103,7 @@ class MachineWorker:
         self._monitor, self.restart = self._restored(installed)
         self._sheds = queue.when_full == "drop" and not self._monitor.watching
         self._snapshot: MachineHealth = self._monitor.health()
-        self.told = self._monitor.next_sequence  # number of the first alarm event that `health` does not show yet
+        self.told = self._monitor.alarms.next_sequence  # first alarm event that `health` does not show yet
         self._seen_s = -math.inf  # when the snapshot was last replaced
         self._missed = self._dropped_logged = 0
         self._publisher_alive = self._replay_announced = False
@@ -124,7 +124,7 @@ class MachineWorker:
         build = partial(MachineMonitor, installed, self._skips)
         monitor, text = restored(build, self.identity, checkpoint, last + 1, report)
         self.steps.kept = tuple(name for name, _ in checkpoint.parts)
-        self.history.go_on_from(monitor.next_sequence - 1)
+        self.history.go_on_from(monitor.alarms.next_sequence - 1)
         self._time.slept(checkpoint.head.recorded_ns)
         # They were committed but perhaps not published; subscribers leave out those that they had by their id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
@@ -364,7 +364,7 @@ class MachineWorker:
         self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False, whole: bool = False
     ) -> None:
         """Commit windows and events, then replace the snapshot and publish."""
-        events += self._monitor.take_events()  # left behind by a defect
+        events += self._monitor.alarms.take()  # left behind by a defect
         now_s, news = self._clocks.monotonic_s(), bool(windows or events or always or whole)
         if not news and len(self.inbox) and now_s - self._seen_s < _LONGEST_UNSEEN_S:
             return

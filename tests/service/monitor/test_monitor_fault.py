@@ -184,7 +184,7 @@ def test_an_event_without_a_text_holds_up_no_other(tmp_path: Path, monkeypatch: 
     told = []
     with bench(tmp_path) as at:
         at.put(block(0))
-        book = at.worker._monitor._alarms
+        book = at.worker._monitor.alarms
         poison = Evidence.model_construct(start_ns=0, end_ns=1, confidence="not a number") if kind == "gap" else None  # type: ignore[arg-type]
         at.worker.inbox.call(
             lambda: told.append(book.update_state(f"data-{kind}", True, START_NS, evidence=poison, at_once=True))
