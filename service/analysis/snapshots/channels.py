@@ -6,10 +6,9 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.window.moments import ComplexArray
 from models.errors import RotorwatchError
 from models.machine import MachineFile
-from models.signals.block import FloatArray
+from models.signals.block import ComplexArray, FloatArray
 from models.signals.channels import Channel, Quantity, parts_seen, state_name
 from rotorwatch.records.snapshots import Units
 
