@@ -1,4 +1,4 @@
-"""A jump of gain is found without a second sensor of its motion; modes and bearings look like none, nor like a delay."""
+"""Jumps of gain are found without a second sensor of the motion; modes and bearings look like none, nor like delays."""
 
 import numpy as np
 import pytest

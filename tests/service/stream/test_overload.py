@@ -277,9 +277,9 @@ def test_turns_are_taken_one_at_a_time_in_order_of_request(monkeypatch: pytest.M
 
 
 def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_sent: int, ahead: int) -> None:
-    """Put blocks so that `ahead` of them always wait at the worker, until `until_sent` are sent."""
+    """Put blocks so that `ahead` of them are always on their way or wait, until `until_sent` are sent."""
     while feed.sequence < until_sent:
-        if len(worker.inbox) < ahead:
+        if feed.sequence - worker.tally.blocks < ahead:
             feed.put(*stream[feed.sequence : feed.sequence + 50])
             feed.sequence += 50
         time.sleep(0.002)  # a loop that never rests takes the processor from the worker
@@ -288,7 +288,7 @@ def hurry(feed: Feed, worker: MachineWorker, stream: list[SampleBlock], until_se
 def test_an_overloaded_service_loses_no_sample_and_replays_identically(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shedding, "_LASTING_S", 0.3)  # data come a hundred times as fast as from a machine
+    monkeypatch.setattr(shedding, "_LASTING_S", 0.1)  # data come a hundred times as fast as from a machine
     stream, file = loud_in_between(LENGTH_S), short_machine(tmp_path)
     recording = RecordingSettings(directory=str(tmp_path / "recordings"))
     with fed_service(file, bound=1500, recording=recording) as (runtime, worker, feed):
