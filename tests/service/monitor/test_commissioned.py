@@ -235,7 +235,7 @@ def test_a_speed_not_commissioned_is_not_evaluable_and_raises_only_levels() -> N
     ("clearance_m", "size", "duration_s", "of"),
     [
         pytest.param(4e-5, 2.0, 66.0, installed, id="heavy"),
-        pytest.param(8e-5, 0.5, 36.0, lambda: Installed(at_once(SHORT)), id="light, not commissioned"),
+        pytest.param(8e-5, 0.5, 56.0, lambda: Installed(at_once(SHORT)), id="light, not commissioned"),
     ],
 )
 def test_a_rub_is_suspected_and_names_uncertain(
