@@ -56,7 +56,11 @@ def expected_lines(bands: BandLevels, hops: float, modes: Sequence[tuple[float, 
     parts, bin_hz = np.maximum(_noise_share(bins), _OTHER_MODES_SHARE), np.diff(bands.edges_hz) / bins
     for natural_hz, damping in modes:
         near = (bands.edges_hz[1:] > natural_hz / _MODE_SHIFT) & (bands.edges_hz[:-1] < natural_hz * _MODE_SHIFT)
-        of_mode = _noise_share(np.maximum(np.pi * damping * natural_hz / bin_hz, 1.0))  # of its noise bandwidth, bins
+        off_hz = np.abs(bands.edges_hz - natural_hz)
+        # A band that ends beside the mode holds half of it.
+        cut = np.minimum(off_hz[:-1], off_hz[1:]) < 2 * damping * natural_hz + bin_hz
+        width = np.pi * damping * natural_hz / bin_hz / np.where(cut, 2, 1)  # noise bandwidth, bins
+        of_mode = _noise_share(np.maximum(width, 1.0))
         most = np.where(of_mode < _LIKE_A_LINE, np.minimum(_SCATTERS * of_mode, _MODE), 1.0)
         parts[near] = np.maximum(parts, most)[near]
     return parts

@@ -26,14 +26,14 @@ TIME_S = np.arange(HOP * HOPS) / RATE_HZ
 
 def window(
     seed: int, *, loud: float = 1.0, mesh: float = 0.0, damping: float = 0.02, wander: float = 0.0,
-    speed_hz: float = SPEED_HZ, unbalance: float = 0.5, known: bool = True,
+    speed_hz: float = SPEED_HZ, unbalance: float = 0.5, known: bool = True, natural_hz: float = 480.0,
 ) -> WindowLevels:  # fmt: skip
-    """A resonance at 480 Hz under noise of level `loud`, 1x, and a mesh of 22 teeth in the first channel.
+    """A resonance under noise of level `loud`, 1x, and a mesh of 22 teeth in the first channel.
 
     The speed may wander up and down within a hop, and the shaft angle be known or not.
     """
     rng = np.random.default_rng([20261240, seed])
-    pole = np.exp(2 * np.pi * 480.0 / RATE_HZ * (-damping + 1j))
+    pole = np.exp(2 * np.pi * natural_hz / RATE_HZ * (-damping + 1j))
     noise = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], rng.standard_normal((2, TIME_S.size)))
     noise = loud * (noise / noise.std() + 0.3 * rng.standard_normal(noise.shape))
     angle = 2 * np.pi * speed_hz * (TIME_S + wander / (2 * np.pi * 0.33) * np.sin(2 * np.pi * 0.33 * TIME_S))
@@ -128,6 +128,14 @@ def test_an_uncommissioned_machine_is_compared_with_the_lines_of_theory(damping:
     text = by_theory(window(102, mesh=4.0, damping=damping), damping)
     assert "a line within 4" in text
     assert "that no rotor of the machine file makes" in text
+
+
+def test_the_skirt_of_a_mode_at_the_edge_of_a_band_is_no_line() -> None:
+    bands = window(110).bands
+    assert bands is not None
+    edge_hz = float(bands.edges_hz[np.searchsorted(bands.edges_hz, 480.0)])
+    at_edge = window(117, damping=0.00097, natural_hz=edge_hz)
+    assert not by_theory(at_edge, 0.00097, natural_hz=edge_hz)
 
 
 def test_a_line_at_a_mode_without_damping_is_not_reported() -> None:
