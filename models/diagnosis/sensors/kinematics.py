@@ -229,9 +229,8 @@ def _across(
     size = float(along[-1] / triangle[-1, -1] / lengths[-1])
     if not abs(size) < _MOST_ACROSS:
         return None
-    fitted = design[:, [0, 1, 3]]  # gain, delay and the other plane, of length 1
-    widening = float(np.sqrt(np.diag(np.linalg.inv(fitted.T @ fitted))[:2].max()))
-    return np.asarray(size * other, dtype=np.complex128), widening
+    inverse = np.linalg.inv(np.linalg.qr(design[:, [0, 1, 3]], mode="r"))  # of gain, delay and the other plane
+    return np.asarray(size * other, dtype=np.complex128), float(np.linalg.norm(inverse[:2], axis=1).max())
 
 
 def _lead(alone: PairReading, h: ComplexArray, variance: FloatArray) -> float:
