@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -118,9 +118,9 @@ def test_events_far_ahead_are_left_to_the_log() -> None:
 class Monitor:
     """A machine's link with a log of its own; publishing or reading it can be made to fail."""
 
-    def __init__(self, link: Link, place: str = PLACE) -> None:
+    def __init__(self, link: Link, place: str = PLACE, log: Iterable[AlarmCloudEvent] = ()) -> None:
         self.place = place
-        self.log: list[AlarmCloudEvent] = []
+        self.log = [*log]
         self.asked: list[tuple[int, int]] = []
         self.broken = ""
 
@@ -146,9 +146,9 @@ class Monitor:
 
 
 @contextmanager
-def monitor(address: str, *places: str) -> Iterator[list[Monitor]]:
+def monitor(address: str, *places: str, log: Iterable[AlarmCloudEvent] = ()) -> Iterator[list[Monitor]]:
     link = Link(LinkSettings(listen=(address,)))
-    found = [Monitor(link, place) for place in places or (PLACE,)]
+    found = [Monitor(link, place, log) for place in places or (PLACE,)]
     try:
         yield found
     finally:
@@ -242,8 +242,7 @@ def test_a_follower_waits_for_a_monitor_and_for_its_restart() -> None:
         with monitor(address) as (first,):
             first.happen()
             following.reaches(0)
-        with monitor(address) as (second,):
-            second.log = [*first.log]
+        with monitor(address, log=first.log) as (second,):  # complete before the follower can ask for it
             second.happen(published=False)
             second.happen()
             following.reaches(2)
