@@ -21,8 +21,9 @@ from models.diagnosis.verdict.stretch import added, stretch_of
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError, MachineFileError
 from models.machine import ConditionRange, Machine, MachineFile, Operation
-from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters, changed
+from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters, changed, natural_frequencies
 from models.signals.block import FloatArray
+from models.stream_settings import segment_for
 
 _ROUNDS = 8
 _SETTLED = 0.02  # largest relative move of a parameter in the last round
@@ -42,6 +43,7 @@ _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
 _NO_STIFFNESS = 1e5  # N/m, placeholder where no plane has a sensor
 _E = PARAMETERS.index("e")
+_NEARLY_RESOLVED = 1.5  # segments shorter by this factor than suits the narrowest mode are still good enough
 _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
 
@@ -88,7 +90,21 @@ def identify(
             return _settled(machine, guess, windows, progress, sense, sized=sized)
         except EstimationError as error:
             failures.append(error)
+    if by_forces and (narrow := unresolved(machine, tried[0])):
+        raise EstimationError(f"{failures[0]}. {narrow}") from failures[0]
     raise failures[0]
+
+
+def unresolved(machine: MachineFile, found: Machine) -> str:
+    """What to do if the segments of a machine file do not resolve the narrowest mode of its rotor; empty if they do."""
+    modes, longer = natural_frequencies(found.rotor, found.operation.speed_rad_s), max(1.0, machine.time_scale)
+    longer_s = segment_for(*modes, machine.window.band_hz[1], longer)
+    if machine.schedule is not None or longer_s <= _NEARLY_RESOLVED * machine.window.segment_s:
+        return ""
+    return (
+        f"A mode of this rotor is so narrow that segments of {machine.window.segment_s:g} s do not resolve it: the "
+        f"healthy machine may raise alarms. Let segment_s in [window] be about {longer_s:g}, and commission again"
+    )
 
 
 def _settled(

@@ -28,7 +28,7 @@ from models.commissioning.commissioned import (
     OperatingRange,
 )
 from models.commissioning.healthy import HealthyRecording
-from models.commissioning.identified import Identified, compare, has_angle, identify
+from models.commissioning.identified import Identified, compare, has_angle, identify, unresolved
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.lag_moments import passband_hz
 from models.diagnosis.baseline.learned import disagreements, learn_baseline, planes_coupled, undetermined, unsuitable
@@ -50,9 +50,9 @@ from models.diagnosis.window.statistics import WindowStatistics, levels_of, wind
 from models.errors import EstimationError
 from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile
-from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS, natural_frequencies
+from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 from models.signals.channels import ACCELERATIONS
-from models.stream_settings import LONGEST_LAG_STEP_S, segment_for
+from models.stream_settings import LONGEST_LAG_STEP_S
 
 Read = tuple[str, int, Diagnosis]  # recording, end of the window in ns, and its diagnosis
 Progress = Callable[[str, int, int], None]  # called with the present step in words, the steps done, and their total
@@ -62,7 +62,6 @@ _OPPOSITE = (
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
 _NO_CHANCE = 3.0  # standard errors beyond which an identified value is not the file's
-_NEARLY_RESOLVED = 1.5  # segments shorter by this factor than suits the narrowest mode are still good enough
 _SHORTEST_HOPS = 4  # with fewer hops, their scatter is too uncertain
 
 
@@ -153,13 +152,8 @@ def _learn_by_theory(
     if any(name in ACCELERATIONS for name in windows[0].states):
         low, high = machine.window.band_hz
         notes = (f"Accelerations are integrated to velocities in the spectrum, valid from {low:g} to {high:g} Hz.",)
-    modes = natural_frequencies(found.machine.rotor, found.machine.operation.speed_rad_s)
-    longer_s = segment_for(*modes, machine.window.band_hz[1], max(1.0, machine.time_scale))
-    if machine.schedule is None and longer_s > _NEARLY_RESOLVED * machine.window.segment_s:
-        notes += (
-            f"A mode of this rotor is so narrow that segments of {machine.window.segment_s:g} s do not resolve it: the "
-            f"healthy machine may raise alarms. Let segment_s in [window] be about {longer_s:g}, and commission again.",
-        )
+    if narrow := unresolved(machine, found.machine):
+        notes += (f"{narrow}.",)
     read = tuple((piece.recording, piece.window.end_ns, each) for piece, each in zip(pieces, stated, strict=True))
     return Learned((check,), read, read, found.machine, record, sense, notes=notes)
 

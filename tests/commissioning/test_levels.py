@@ -427,6 +427,16 @@ def test_a_note_asks_for_segments_that_resolve_the_narrowest_mode(segment_s: flo
 
 
 @pytest.mark.slow
+def test_a_rotor_that_is_not_identified_for_its_narrow_modes_is_refused_with_the_segments_it_needs() -> None:
+    machine = PARTIAL.model_copy(update={"window": PARTIAL.window.model_copy(update={"segment_s": 1.0})})
+    ringing = (Event(at_s=0.0, parameter=name, relative_change=-0.985) for name in ("c_by", "c_bz"))
+    made = commissioned(machine, recording(machine, stream(70.0, 41, *ringing)))
+    assert made.commissioned is None
+    assert "segments of 1 s do not resolve it" in made.report.summary
+    assert "Let segment_s in [window] be about 10, and commission again" in made.report.summary
+
+
+@pytest.mark.slow
 def test_a_note_states_the_valid_band_of_the_derivatives() -> None:
     note, linear = made_at("none").report.notes
     assert linear.startswith("The relations are linear.")
