@@ -215,13 +215,12 @@ def check_lines(machine: MachineFile, recordings: Sequence[HealthyRecording]) ->
         "a neighbouring machine, a gear or the mains also excites the rotor: the relations hold for noise "
         "and unbalance; record while the other machine is stopped, or exclude the line from the band"
     )
-    unknown_speed = all(one.plan.angle_column is None and one.plan.speed_rad_s is None for one in recordings)
-    if unknown_speed:
-        advice = (
-            "without a phase reference this may be the rotation itself: give speed_rpm in [operation], or measure the "
-            f"shaft angle; if it is not, {advice}"
-        )
-    dominant = unknown_speed or any(line.share > _DOMINANT_LINE for _, line in loud)
+    no_angle, given = all(one.plan.angle_column is None for one in recordings), machine.operation
+    orders = [2 * np.pi * line.frequency_hz / given.speed_rad_s for _, line in loud] if given else []
+    if no_angle and (given is None or any(abs(one - 1) < given.speed_tolerance for one in orders)):
+        cure = "measure the shaft angle" if given else "give speed_rpm in [operation], or measure the shaft angle"
+        advice = f"without a phase reference this may be the rotation itself: {cure}; if it is not, {advice}"
+    dominant = (no_angle and given is None) or any(line.share > _DOMINANT_LINE for _, line in loud)
     return told(verdict="refused" if dominant else "limited", text=text, advice=advice)
 
 

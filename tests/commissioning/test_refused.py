@@ -38,6 +38,7 @@ from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     PARTIAL,
+    blind,
     commissioned,
     healthy,
     humming,
@@ -49,6 +50,7 @@ from tests.commissioning.rotor_kit import (
     windows_of,
     with_samples,
     with_sensors,
+    without_angle,
 )
 from tests.sure import sure
 
@@ -214,6 +216,22 @@ def test_a_line_from_a_neighbouring_machine_is_named() -> None:
     sensors = tuple(one.model_copy(update={"name": f"XE-{one.name}"}) for one in NOTHING.sensors)
     named = check_lines(NOTHING.model_copy(update={"sensors": sensors}), [recording(NOTHING, disturbed)]).text
     assert "of the random vibration of XE-" in named
+
+
+@pytest.mark.parametrize(
+    ("speed_rpm", "cure"), [(None, "give speed_rpm in [operation], or measure"), (2000.0, "measure"), (1320.0, None)]
+)
+def test_without_a_shaft_angle_a_line_near_the_stated_speed_may_be_the_rotation(
+    speed_rpm: float | None, cure: str | None
+) -> None:
+    """At 2000 rpm, which may be off by half, it may as well be the line that is not taken for the rotation."""
+    tolerance = 0.5 if speed_rpm == 2000.0 else 0.1
+    given = None if speed_rpm is None else Operation(speed_rpm=speed_rpm, speed_tolerance=tolerance)
+    machine = blind(PARTIAL).model_copy(update={"operation": given})
+    made = recording(machine, without_angle(humming(stream(HEALTHY_S, 56), 48.6, bearing_m=20e-6)))
+    advice = check_lines(machine, [made]).advice
+    assert ("this may be the rotation itself" in advice) == (cure is not None)
+    assert f"itself: {cure} the shaft angle; if" in advice or cure is None
 
 
 @pytest.mark.slow
