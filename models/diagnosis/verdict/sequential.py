@@ -173,6 +173,7 @@ class SequentialTest:
             own[windows * window_hops] = total.blurred(self.settings.systematic)
         own[window_hops] = looks[window_hops]
         self._watch_for_contradiction(own)  # without the shared error, which makes none contradict another
+        self._watch_for_misfit(own)
         every = {hops: look.complete().believed() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
@@ -289,6 +290,20 @@ class SequentialTest:
                     if not longer.unexplained:
                         self.state.before = tuple(whole[0].tolist())
                     return
+
+    def _watch_for_misfit(self, every: Mapping[int, Stretch]) -> None:
+        """Date a change if a window begins to misfit and none of the shorter stretches does.
+
+        The window may mix two conditions of a healthy machine, such as colours of its forces: later data say whether it
+        is outside the model. What no parameter describes shows at once in short stretches, which hold more of it.
+        """
+        state, hops = self.state, self.settings.window_hops
+        window, length_ns = every[hops], every[hops].end_ns - every[hops].start_ns
+        misfits = [one for one in every if one <= hops and model_test(every[one], self._thresholds(one))[0]]
+        lately = state.dated_ns is not None and window.start_ns - state.dated_ns <= length_ns
+        begins = state.outside_ns is None and self._is_clean(window) and not lately and not window.unexplained
+        if begins and misfits == [hops] and min(every) < hops:
+            state.change_ns = state.dated_ns = window.end_ns
 
     def _decide(
         self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]

@@ -274,24 +274,37 @@ def test_the_time_for_which_a_misfit_may_come_from_a_change_counts_down() -> Non
     assert left_s == [0.0] * 3 + [60.0 - 5.0 * hop for hop in range(12)] + [0.0, 0.0]
 
 
-@pytest.mark.parametrize(("before", "lasting"), [(13, True), (4, False)])
+def with_misfits(looks: dict[int, Stretch], short_z: float, window_z: float) -> dict[int, Stretch]:
+    return {h: replace(one, misfit_z=window_z if h == SETTINGS.window_hops else short_z) for h, one in looks.items()}
+
+
+@pytest.mark.parametrize("short_z", [0.0, 8.0])
+def test_a_window_that_mixes_two_conditions_is_not_outside_the_model(short_z: float) -> None:
+    """As after a change of the forces' colour; a machine outside the model shows in short stretches as well."""
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 49)
+    said = []
+    for misfits in (False,) * 20 + (True,) * 10 + (False,) * 10:
+        looks = with_misfits(hops.looks(true()), short_z * misfits, 8.0 * misfits)
+        if looks:
+            said.append(test.update(looks).outside_model)
+    assert said[:9] == [False] * 9
+    assert said[9:19] == [short_z > 0.0] * 10
+    assert said[19:] == [False] * 10
+
+
+@pytest.mark.parametrize(("before", "lasting"), [(25, True), (16, False)])
 def test_a_lasting_outside_verdict_is_withdrawn_only_by_a_whole_window(before: int, lasting: bool) -> None:
     """Shorter stretches do not show the misfit; but while a window spans a change, the misfit may come from it."""
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 47)
     said: list[bool] = []
     for count, values, misfit in ((15, true(), 0.0), (before, true(), 8.0), (11, true(k_by=0.4), 8.0)):
         for _ in range(count):
-            looks = {
-                h: replace(one, misfit_z=misfit if h == SETTINGS.window_hops else 0.0)
-                for h, one in hops.looks(values).items()
-            }
-            if looks:
+            if looks := with_misfits(hops.looks(values), 0.0, misfit):
                 said.append(test.update(looks).outside_model)
-    assert all(said[-11 - before : -11])
+    assert said[-11 - before : -11] == [False] * 12 + [True] * (before - 12)
     assert said[-9:] == [lasting] * 9  # from the second hop on the change shows
     for _ in range(3):
-        looks = {h: replace(one, misfit_z=0.0) for h, one in hops.looks(true(k_by=0.4)).items()}
-        outside = test.update(looks).outside_model
+        outside = test.update(with_misfits(hops.looks(true(k_by=0.4)), 0.0, 0.0)).outside_model
     assert not outside
 
 
