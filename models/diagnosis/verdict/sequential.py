@@ -299,10 +299,11 @@ class SequentialTest:
         """
         state, hops = self.state, self.settings.window_hops
         window, length_ns = every[hops], every[hops].end_ns - every[hops].start_ns
-        misfits = [one for one in every if one <= hops and model_test(every[one], self._thresholds(one))[0]]
+        tested = [one for one, look in every.items() if one <= hops and look.misfit_z is not None]
+        misfits = [one for one in tested if model_test(every[one], self._thresholds(one))[0]]
         lately = state.dated_ns is not None and window.start_ns - state.dated_ns <= length_ns
         begins = state.outside_ns is None and self._is_clean(window) and not lately and not window.unexplained
-        if begins and misfits == [hops] and min(every) < hops:
+        if begins and misfits == [hops] and len(tested) > 1:
             state.change_ns = state.dated_ns = window.end_ns
 
     def _decide(
