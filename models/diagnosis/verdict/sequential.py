@@ -173,7 +173,8 @@ class SequentialTest:
             own[windows * window_hops] = total.blurred(self.settings.systematic)
         own[window_hops] = looks[window_hops]
         self._watch_for_contradiction(own)  # without the shared error, which makes none contradict another
-        self._watch_for_misfit(own)
+        tested = any(hops < window_hops and look.misfit_z is not None for hops, look in own.items())
+        self._watch_for_misfit(own[window_hops], short=tested)
         every = {hops: look.complete().believed() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
@@ -291,19 +292,17 @@ class SequentialTest:
                         self.state.before = tuple(whole[0].tolist())
                     return
 
-    def _watch_for_misfit(self, every: Mapping[int, Stretch]) -> None:
-        """Date a change if a window begins to misfit and none of the shorter stretches does.
+    def _watch_for_misfit(self, window: Stretch, *, short: bool) -> None:
+        """Date a change if the window begins to misfit, and the `short` stretches are tested as well.
 
-        The window may mix two conditions of a healthy machine, such as colours of its forces: later data say whether it
-        is outside the model. What no parameter describes shows at once in short stretches, which hold more of it.
+        It may mix two conditions of a healthy machine, such as colours of its forces: whether the machine is outside
+        the model is said by data from now on. They say so soon, as they hold more of what has changed.
         """
-        state, hops = self.state, self.settings.window_hops
-        window, length_ns = every[hops], every[hops].end_ns - every[hops].start_ns
-        tested = [one for one, look in every.items() if one <= hops and look.misfit_z is not None]
-        misfits = [one for one in tested if model_test(every[one], self._thresholds(one))[0]]
-        lately = state.dated_ns is not None and window.start_ns - state.dated_ns <= length_ns
-        begins = state.outside_ns is None and self._is_clean(window) and not lately and not window.unexplained
-        if begins and misfits == [hops] and len(tested) > 1:
+        state = self.state
+        misfits = model_test(window, self._thresholds(self.settings.window_hops))[0] and not window.unexplained
+        # The first whole windows after a change decide.
+        just = state.change_ns is not None and window.start_ns - state.change_ns <= 2e9 * self.settings.hop_s
+        if short and misfits and state.outside_ns is None and self._is_clean(window) and not just:
             state.change_ns = state.dated_ns = window.end_ns
 
     def _decide(

@@ -255,8 +255,9 @@ def test_a_foreign_cause_that_one_parameter_rivals_is_not_outside_the_model() ->
     for _ in range(20):
         looks = hops.looks(true(k_bz=-0.15))
     for rivals, misfit, outside in [(("k_bz", "c_bz"), 0.0, False), (("k_by",), 0.0, True), (("k_bz",), 8.0, True)]:
-        looks = {h: replace(look, misfit_z=misfit) for h, look in looks.items()}
-        verdict = test.update(looks, foreign=True, rivals=rivals)
+        for _ in range(4):  # a window that begins to misfit is not yet outside the model
+            looks = {h: replace(look, misfit_z=misfit) for h, look in hops.looks(true(k_bz=-0.15)).items()}
+            verdict = test.update(looks, foreign=True, rivals=rivals)
         assert [one.name for one in verdict.changed] == ["k_bz"]
         assert verdict.outside_model == outside
         assert verdict.low_confidence
@@ -280,15 +281,15 @@ def with_misfits(looks: dict[int, Stretch], short_z: float, window_z: float) -> 
 
 @pytest.mark.parametrize("short_z", [0.0, 8.0])
 def test_a_window_that_mixes_two_conditions_is_not_outside_the_model(short_z: float) -> None:
-    """As after a change of the forces' colour; a machine outside the model shows in short stretches as well."""
+    """As after a change of the forces' colour; a machine outside the model shows in later short stretches as well."""
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 49)
     said = []
     for misfits in (False,) * 20 + (True,) * 10 + (False,) * 10:
         looks = with_misfits(hops.looks(true()), short_z * misfits, 8.0 * misfits)
         if looks:
             said.append(test.update(looks).outside_model)
-    assert said[:9] == [False] * 9
-    assert said[9:19] == [short_z > 0.0] * 10
+    assert said[:11] == [False] * 11
+    assert said[11:19] == [short_z > 0.0] * 8
     assert said[19:] == [False] * 10
 
 
