@@ -293,13 +293,13 @@ class SequentialTest:
                     return
 
     def _watch_for_misfit(self, window: Stretch, *, short: bool) -> None:
-        """Date a change if the window begins to misfit, and the `short` stretches are tested as well.
+        """Date a change if the window begins to misfit, or is unexplained, and `short` stretches are tested as well.
 
         It may mix two conditions of a healthy machine, such as colours of its forces: whether the machine is outside
         the model is said by data from now on. They say so soon, as they hold more of what has changed.
         """
         state, earlier = self.state, self.state.sums[1][:-1]
-        misfits = model_test(window, self._thresholds(self.settings.window_hops))[0] and not window.unexplained
+        misfits = window.unexplained or model_test(window, self._thresholds(self.settings.window_hops))[0]
         # The first whole windows after a change decide.
         just = state.change_ns is not None and window.start_ns - state.change_ns <= 2e9 * self.settings.hop_s
         if earlier and short and misfits and state.outside_ns is None and self._is_clean(window) and not just:
