@@ -298,11 +298,9 @@ class SequentialTest:
         It may mix two conditions of a healthy machine, such as colours of its forces: whether the machine is outside
         the model is said by data from now on. They say so soon, as they hold more of what has changed.
         """
-        state, earlier = self.state, self.state.sums[1][:-1]
-        misfits = window.unexplained or model_test(window, self._thresholds(self.settings.window_hops))[0]
-        # The first whole windows after a change decide.
-        just = state.change_ns is not None and window.start_ns - state.change_ns <= 2e9 * self.settings.hop_s
-        if earlier and short and misfits and state.outside_ns is None and self._is_clean(window) and not just:
+        state, limits = self.state, self._thresholds(self.settings.window_hops)
+        misfit = [one.unexplained != "" or model_test(one, limits)[0] for one in (*state.sums[1][-2:-1], window)]
+        if short and misfit == [False, True] and state.outside_ns is None and self._is_clean(window):
             state.change_ns = state.dated_ns = window.end_ns
 
     def _decide(
