@@ -59,6 +59,7 @@ class SequentialSettings:
     # Standard error of every parameter that more windows do not remove: an estimate relative to nominal values does not
     # become exact however long it is averaged.
     systematic: float = 0.002
+    reach_s: float = 0.0  # how far before a stretch its first segment begins
 
     @classmethod
     def for_machine(
@@ -73,6 +74,7 @@ class SequentialSettings:
             window_hops=machine.window.hops,
             short_hops=tuple(hops for hops in _SHORT_HOPS if short and hops < machine.window.hops),
             false_alarms_per_month=machine.alarms.false_alarms_per_month if per_month is None else per_month,
+            reach_s=machine.window.segment_s / 2,
         )
 
     @property
@@ -301,7 +303,7 @@ class SequentialTest:
         state, limits = self.state, self._thresholds(self.settings.window_hops)
         misfit = [one.unexplained != "" or model_test(one, limits)[0] for one in (*state.sums[1][-2:-1], window)]
         if short and misfit == [False, True] and state.outside_ns is None and self._is_clean(window):
-            state.change_ns = state.dated_ns = window.end_ns
+            state.change_ns, state.dated_ns = window.end_ns + round(self.settings.reach_s * 1e9), window.end_ns
 
     def _decide(
         self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]
