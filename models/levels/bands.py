@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field
 from scipy.special import fdtri
 
 from models.signals.block import FloatArray, IndexArray
+from rotorwatch.records.levels import three_digits
 
 BEYOND_RANGE, ERRORS = 1.25, 6.0
 """No limit is nearer than this many times the largest healthy level, or this many standard errors of a window."""
@@ -163,4 +164,4 @@ def band_in_words(band_hz: tuple[float, float]) -> str:
     >>> band_in_words((94.567, 5202.4))
     '94.6 to 5202 Hz'
     """
-    return "{} to {} Hz".format(*(f"{edge:.3g}" if edge < 1000 else f"{edge:.0f}" for edge in band_hz))
+    return "{} to {} Hz".format(*map(three_digits, band_hz))

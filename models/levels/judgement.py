@@ -35,7 +35,7 @@ from models.levels.reference import LevelReference, OperatingState
 from models.levels.settings import ZONES, LevelSettings, zone_of
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, unit_in_text
-from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits, three_digits
 from rotorwatch.records.windows import SensorFault
 
 _ERRORS_OF_CONTACT = 5.0
@@ -283,7 +283,8 @@ class LevelJudge:
                 was_deg = math.degrees(sense * cmath.phase(region.centre)) % 360
                 out = (
                     f"phase lag {values[_ROW['x1_phase_lag_deg']]:.0f}°: outside its acceptance region around "
-                    f"{shown_level(channel, 'x1', region.mean):.3g} {unit_in_text(channel.unit)} at {was_deg:.0f}°"
+                    f"{three_digits(shown_level(channel, 'x1', region.mean))} {unit_in_text(channel.unit)} "
+                    f"at {was_deg:.0f}°"
                 )
         words = MEASURE_WORDS
         key = column, id(relative), standard, zone, edge, told  # unique while the reference is kept
@@ -361,13 +362,13 @@ class LevelJudge:
         """On which side of its limits a level is; `out` is the text for a 1x vector out of its acceptance region."""
         danger, alert, fall = nearest.danger, nearest.alert, nearest.fall
         if _reached(danger.danger, value):
-            state, decided, what = "danger", danger, f"danger limit {danger.danger:.3g} ({danger.source})"
+            state, decided, what = "danger", danger, f"danger limit {three_digits(danger.danger)} ({danger.source})"
         elif _reached(alert.alert, value):
-            state, decided, what = "alert", alert, f"alert limit {alert.alert:.3g} ({alert.source})"
+            state, decided, what = "alert", alert, f"alert limit {three_digits(alert.alert)} ({alert.source})"
             if alert.source == _X1_VECTOR:
                 what = out
         elif value < fall.fall:
-            state, decided, what = "alert", fall, f"alert below {fall.fall:.3g} ({fall.source})"
+            state, decided, what = "alert", fall, f"alert below {three_digits(fall.fall)} ({fall.source})"
         else:  # not a number
             return nearest.normal
         unit = unit_of(channel.unit, name, channel.quantity in PEAK_TO_PEAK)
@@ -377,7 +378,7 @@ class LevelJudge:
                 "absolute": decided.absolute,
                 "source": decided.source,
                 "state": state,
-                "text": f"{said} {value:.3g} {unit_in_text(unit)}, {what}",
+                "text": f"{said} {three_digits(value)} {unit_in_text(unit)}, {what}",
             }
         )
 
@@ -432,7 +433,7 @@ class ChannelState:
 
 
 def channel_state(levels: ChannelLevels) -> ChannelState:
-    """Sum up the limits of a channel."""
+    """Sum up the limits of a channel; the text names channel and place once, before the worst level."""
     limits = levels.limits
     texts = sorted((one.state != "danger", not one.absolute, one.text) for one in limits if one.text)
     return ChannelState(
@@ -440,7 +441,7 @@ def channel_state(levels: ChannelLevels) -> ChannelState:
         danger=levels.beyond == "danger",
         absolute=any(one.state != "normal" and one.absolute for one in limits),
         small=all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits),
-        text="; ".join(text for *_, text in texts),
+        text="; ".join(text if at == 0 else text.split(") ", 1)[1] for at, (*_, text) in enumerate(texts)),
     )
 
 
@@ -476,7 +477,7 @@ def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
         word = "strongest band"
     text = (
         f"growth of {growth:.0%} in any channel would have raised an alert; last in {one.channel}, whose {word} is "
-        f"{value:.3g} {unit_in_text(unit)} with an alert limit of {limit:.3g}"
+        f"{three_digits(value)} {unit_in_text(unit)} with an alert limit of {three_digits(limit)}"
     ).replace("%", " %")
     return LevelGrowth(growth=rounded(growth), channel=one.channel, measure=measure, text=text)
 

@@ -19,6 +19,17 @@ class LevelBound(Record):
     fall: Number = Field(default=None, description="alert below; null without such a limit", examples=[None])
 
 
+def three_digits(value: float) -> str:
+    """A level with three significant digits, and with all those before the decimal point.
+
+    Examples
+    --------
+    >>> three_digits(0.04968), three_digits(999.7), three_digits(-1014.6)
+    ('0.0497', '1000', '-1015')
+    """
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+
+
 class LevelLimits(Record):
     """Limits by which one level is judged, and its state."""
 
@@ -136,11 +147,12 @@ class ChannelLevels(Record):
         'DE-H 1.93 m/s2 rms, velocity 2.1 mm/s rms, 1x 1.1, zone B'
         """
         detection = "pp" if self.detection == "peak to peak" else "rms"
-        overall = "nothing" if self.overall is None else f"{self.overall:.3g} {self.unit} {detection}"
+        unit = self.unit.replace("um", "µm")
+        overall = "nothing" if self.overall is None else f"{three_digits(self.overall)} {unit} {detection}"
         parts = [f"{self.channel} {overall}"]
-        parts += [] if self.velocity is None else [f"velocity {self.velocity:.3g} mm/s rms"]
-        parts += [] if self.x1 is None else [f"1x {self.x1:.3g}"]
-        parts += [] if self.mean is None else [f"gap {self.mean:.3g}"]
+        parts += [] if self.velocity is None else [f"velocity {three_digits(self.velocity)} mm/s rms"]
+        parts += [] if self.x1 is None else [f"1x {three_digits(self.x1)}"]
+        parts += [] if self.mean is None else [f"gap {three_digits(self.mean)} {unit}"]
         return ", ".join(parts + ([f"zone {self.zone}"] if self.zone else []))
 
     def limit(self, measure: str) -> LevelLimits | None:

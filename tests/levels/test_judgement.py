@@ -206,6 +206,15 @@ def test_a_level_beyond_all_numbers_reaches_only_limits_that_are_there() -> None
     assert found.text.endswith("inf mm/s rms, alert limit 4 (own limit)")
 
 
+def test_a_channel_beyond_several_limits_is_named_once_in_plain_figures() -> None:
+    own = [{"channel": "DE-H", "alert": 1000.0, "danger": 2000.0}, {"channel": "DE-H", "measure": "peak", "alert": 3.0}]
+    text = channel_state(judged(CASING, window(overall=2.345, peak=4e-3), limits=own)).text
+    assert text == (
+        "DE-H (DE horizontal) overall 2345 mm/s rms, danger limit 2000 (own limit); "
+        "peak 4 mm/s peak, alert limit 3 (own limit)"
+    )
+
+
 def test_a_channel_clears_only_below_the_deadband() -> None:
     settings: dict[str, Any] = {"limits": [{"channel": "DE-H", "alert": 10.0}]}
     for level, beyond, small in ((10.5, True, False), (9.5, False, False), (8.9, False, True)):
