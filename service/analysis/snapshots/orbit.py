@@ -74,7 +74,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
         pulses_s=known_figures(path.pulses / machine.rate_hz),
         reason=reason,
-        path_reason=path.reason,
+        path_reason=path.reason if there else reason,
     )
 
 

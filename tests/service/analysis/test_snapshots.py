@@ -314,6 +314,7 @@ def test_channels_are_chosen_by_name_and_velocities_by_default_without_displacem
     orbits = snapshots_of(rates).orbits(data)
     assert orbits.orbits == ()
     assert orbits.reason.endswith("measured displacements: none")
+    assert orbits.path_reason == orbits.reason  # nothing of revolutions that nobody can see
 
 
 def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,8 @@ import "../elements/state-mark.js";
 /** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
 /** @typedef {import("../monitor/records.d.ts").ChannelLevels} ChannelLevels */
 
-const MEASURES = /** @type {(keyof ChannelLevels)[]} */ (["overall", "velocity", "x1", "x2", "crest", "kurtosis"]);
+/** Measures that are shown even without a limit. */
+const MEASURES = ["overall", "velocity", "x1", "x2", "crest", "kurtosis"];
 
 /** Reading of a parameter in a report: since a change within its window, or over the whole window. @param {Report} report @param {string} name @returns {Parameter | undefined} */
 function reading(report, name) {
@@ -141,15 +142,18 @@ class WhyView extends HTMLElement {
     const now = after.levels.find((one) => one.channel === channel);
     const was = before?.levels.find((one) => one.channel === channel);
     if (!now) return null;
-    const rows = MEASURES.filter((measure) => now[measure] !== null).map((measure) => {
+    const measures = /** @type {Set<keyof ChannelLevels>} */ (new Set([...MEASURES, ...now.limits.map((one) => one.measure)]));
+    const rows = [...measures].filter((measure) => now[measure] !== null).map((measure) => {
       const [old, value] = [was?.[measure], now[measure]].map((one) => (typeof one === "number" ? one : null));
+      const limits = now.limits.find((one) => one.measure === measure);
       return {
+        attributes: { class: limits?.state },
         cells: [
           html("b", {}, measureText(measure)),
           html("span", { class: "number" }, quantity(old, levelUnit(now, measure))),
           html("span", { class: "number" }, quantity(value, levelUnit(now, measure))),
           html("span", { class: "number" }, old && value ? `× ${figure(value / old)}` : ""),
-          html("span", {}, limitText(now.limits.find((one) => one.measure === measure), now)),
+          html("span", {}, limitText(limits, now)),
         ],
       };
     });

@@ -22,7 +22,7 @@ class DataQuality extends MachineElement {
       ["newest data", age === null ? "none since the monitor started" : `${lasting(age)} old`],
       ["silent", stream.silent && `since ${clock(stream.silent_since_ns)}`],
       ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
-      ["speed", speed !== null && `${figure((speed * 30) / Math.PI)} rpm (${figure(speed)} rad/s)`],
+      ["speed", speed !== null && `${figure(Math.round((speed * 300) / Math.PI) / 10)} rpm`],
       ["misfit", typeof report?.misfit_z === "number" && `${figure(report.misfit_z)} standard deviations`],
       ["gyroscopic moments", report?.gyroscopic === "opposite" && "the opposite sense to Eq. (27): it explains this machine"],
       ["blocks", `${quality.accepted_blocks} accepted, ${refused.reduce((sum, [, count]) => sum + count, 0)} refused`],

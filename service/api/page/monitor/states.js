@@ -44,7 +44,7 @@ export function byUrgency(one, other) {
 }
 
 /** Names of a channel's measures. @type {Record<string, string>} */
-const MEASURES = { x_half: "½×", x1: "1×", x2: "2×", x3: "3×", not_x1: "not 1×", mean: "gap", s_max: "S_max", crest: "crest factor" };
+const MEASURES = { x_half: "½×", x1: "1×", x2: "2×", x3: "3×", not_x1: "not 1×", mean: "gap", s_max: "S_max", crest: "crest factor", high: "high frequency" };
 
 /** @param {string} measure */
 export const measureText = (measure) => MEASURES[measure] ?? measure;

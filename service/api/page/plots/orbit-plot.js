@@ -60,7 +60,7 @@ class OrbitPlot extends MachineElement {
   async ask() {
     const found = /** @type {Orbits} */ (await this.askFor("orbits", `revolutions=${REVOLUTIONS}`));
     const drawn = found.orbits.filter((one) => one.ellipse || one.path);
-    const reasons = [this.windowText(found), found.reason, found.path_reason].filter(Boolean).join("; ");
+    const reasons = [...new Set([this.windowText(found), found.reason, found.path_reason])].filter(Boolean).join("; ");
     this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => orbitFigure(one, found.pulses_s))), html("p", { class: "note" }, reasons));
   }
 

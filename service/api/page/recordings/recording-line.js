@@ -12,14 +12,14 @@ const RANGES = /** @type {[string, string][]} */ ([["", "everything shown below"
 
 /** Recordings on a time line, with the machine's alarms above; clicking an alarm selects the recordings around it. */
 class RecordingLine extends HTMLElement {
-  #range = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Range of the time line", change: () => this.#draw() }, ...RANGES.map(([hours, text]) => html("option", { value: hours }, text))));
+  #range = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Range of the timeline", change: () => this.#draw() }, ...RANGES.map(([hours, text]) => html("option", { value: hours }, text))));
   #picture = html("div", { class: "time-line" });
   #alarms = html("div");
   /** @type {{place: string, recordings: RecordingEntry[], alarms: AlarmEvent[], chosen: Chosen} | null} */
   #known = null;
 
   connectedCallback() {
-    lay(this, html("label", {}, "Time line: ", this.#range), this.#picture, this.#alarms);
+    lay(this, html("label", {}, "Timeline: ", this.#range), this.#picture, this.#alarms);
   }
 
   /** @param {string} place @param {RecordingEntry[]} recordings @param {AlarmEvent[]} alarms @param {Chosen} chosen */

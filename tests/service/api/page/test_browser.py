@@ -13,7 +13,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.fields import EXAMPLE_NS
 from rotorwatch.records.health import Health
 from rotorwatch.records.history import ReadingBucket
-from rotorwatch.records.levels import LevelGrowth
+from rotorwatch.records.levels import ChannelLevels, LevelGrowth, LevelLimits
 from rotorwatch.records.windows import SensorFault, Shape
 from service.access.scopes import Scope
 from service.runtime.runtime import Runtime
@@ -154,6 +154,9 @@ def test_a_fault_is_shown_explained_and_acknowledged(browser: Browser, plant: Pl
         second.route("**/evidence*", _as_an_earlier_version_kept_it)
         second.goto(f"{url}/#/why/demo/lab/k_by")
         expect(second.locator("before-after .note")).to_have_text(re.compile("^Correlation functions were not kept"))
+        second.route("**/evidence*", _of_a_damaged_bearing)
+        second.reload()
+        expect(second.locator("why-view tr.danger")).to_have_text("envelope– m/s² rms0.3 m/s² rmsdanger limit 0.2")
 
         plant.cut.set()
         page.goto(f"{url}/#/")
@@ -223,7 +226,7 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
         page.route("**/recordings-view.js", lambda route: route.fulfill(body="throw 0", content_type="text/javascript"))
         page.get_by_role("link", name="Recordings").click()
         expect(page.locator("main")).to_contain_text("There is no connection to the monitor")
-    told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing]}
+    told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing], "speed_rad_s": 3.3e-5}
     told["alarms"] = [told["alarms"][0] | {"name": "level:DE-H", "severity": "danger"}]
     with looking(browser, url) as page:
         tell_instead(page, told)
@@ -241,6 +244,7 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
         expect(page.locator("level-table")).to_contain_text("17.3")
         expect(fold).to_be_focused()
         expect(page.locator("level-table details")).to_have_attribute("open", "")
+        expect(page.locator("data-quality")).to_contain_text("speed0 rpm")
         expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")
         expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
     told |= {"alarms": [], "state": "not-evaluable"}
@@ -340,6 +344,20 @@ def _as_an_earlier_version_kept_it(route: Route) -> None:
     for picture in filter(None, (told["before"], told["raised"], told["settled"])):
         del picture["correlations"]
     route.fulfill(json=told)
+
+
+def _of_a_damaged_bearing(route: Route) -> None:
+    told = route.fetch().json()
+    limit = example(LevelLimits) | {
+        "measure": "envelope",
+        "alert": None,
+        "fall": None,
+        "danger": 0.2,
+        "state": "danger",
+    }
+    for picture in filter(None, (told["raised"], told["settled"])):
+        picture["report"]["levels"] = [example(ChannelLevels) | {"channel": "DE-H", "limits": [limit]}]
+    route.fulfill(json=told | {"name": "level:DE-H"})
 
 
 _WRITTEN = """
