@@ -56,6 +56,14 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
 _OTHER_LOCATIONS = ("DE", "NDE", "casing")
 """Names of other places, which are never taken for a misspelt location of the model."""
+_TILT = "location 'disc', direction y or z"
+_EXPECTED = {
+    Quantity.SHAFT_ANGLE: "location 'shaft', direction 'rotation'", Quantity.TILT: _TILT, Quantity.TILT_RATE: _TILT,
+}  # fmt: skip
+_EXPECTED_VIBRATION = (
+    "location 'bearing' or 'disc', direction y or z (horizontal or vertical), or angle_deg; at places with other names "
+    f"({', '.join(_OTHER_LOCATIONS)}, …), where the direction is free, only levels are watched"
+)
 LEAST_APART_DEG = 30.0
 """Least angle between two sensors that are resolved into y and z: at less, the result would be mostly their noise."""
 _PLACE = r"^[A-Za-z0-9][A-Za-z0-9 _.:/+-]*$"
@@ -114,13 +122,12 @@ class Channel(BaseModel, extra="forbid", frozen=True):
             return self
         known = self.location in _LOCATIONS
         hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
-        hint = "" if self.location in _OTHER_LOCATIONS else hint
+        if not known and (self.location in _OTHER_LOCATIONS or not self.location.isalpha()):
+            hint = ""  # "bearing1" and "bearing DE" are names
         if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
-                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z, "
-                "or two at an angle, each with angle_deg; "
-                f"at places with other names ({', '.join(_OTHER_LOCATIONS)}, …) only levels are watched{hint}"
+                f"expected {_EXPECTED.get(self.quantity, _EXPECTED_VIBRATION)}{hint}"
             )
         return self
 

@@ -369,6 +369,12 @@ def test_unusable_channels_are_refused(fields: dict[str, str], message: str) -> 
         Channel.model_validate(_channel(**fields))
 
 
+@pytest.mark.parametrize("location", ["bearing1", "bearing DE", "shaft-end"])
+def test_a_place_with_more_than_a_word_is_a_name_not_a_misspelling(location: str) -> None:
+    channel = Channel.model_validate(_channel(location=location, direction="vertical"))
+    assert state_name(channel) == "@XE-1"  # of which only levels are watched
+
+
 def test_a_name_or_a_quantity_occurs_once() -> None:
     with pytest.raises(ValidationError, match="channel name occurs twice: XE-1"):
         _descriptor(_channel(), _channel(direction="z"))
