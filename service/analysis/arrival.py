@@ -17,7 +17,9 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage
 from models.signals.waveform import waveform_of
 from models.signals.wire import decode_block
+from rotorwatch.records.levels import three_digits
 from service.analysis.revolutions import Excerpt
+from service.monitor.conversion import rfc3339
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
 
@@ -83,6 +85,10 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         lines.append(f"sampling rate {found} Hz, expected {machine.rate_hz:g}")
     if accepted:
         troubles += [fault.text for fault in missing.found(accepted[0].start_ns, accepted[-1].end_ns)]
+        ahead_s = (accepted[-1].end_ns - stream[-1].log_time_ns) / 1e9
+        clocks = "ahead of" if ahead_s > 0 else "behind"
+        newest = rfc3339(accepted[-1].end_ns)
+        lines.append(f"newest sample of {newest}, {three_digits(abs(ahead_s))} s {clocks} this computer's clock")
         lines += _of_samples(machine, accepted, troubles)
     return Arrival(tuple(lines), tuple(troubles))
 
@@ -102,7 +108,11 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
         speed = Excerpt(blocks[0].start_ns, plan.rate_hz, samples, angle).speed_rad_s
         lines.append(f"keyphasor: the shaft turns at {abs(speed) * 30 / np.pi:.1f} rpm")
         if abs(speed) < np.pi:
-            troubles.append("the shaft angle does not turn: the machine stands still, or the keyphasor gives no pulses")
+            troubles.append(
+                f"the shaft angle does not turn; it is between {angle.min():.3g} and {angle.max():.3g} rad: the "
+                "machine stands still, the keyphasor gives no pulses, or its signal is sent instead of an angle from 0 "
+                "to 2 pi"
+            )
     if plan.levels is None:
         return lines
     vibration = samples[:, : plan.columns.size]

@@ -319,7 +319,9 @@ class Writer:
 
 
 def _claimed_elsewhere(claim: Claim) -> StoreError:
-    return StoreError(f"another monitor writes the history of {claim.title}")
+    return StoreError(
+        f"another monitor writes the history of {claim.title}: stop it, or give this one its own [history] url"
+    )
 
 
 def _is_operational(error: Exception) -> bool:

@@ -58,7 +58,11 @@ def export(
         if table.rows == 0:
             names = ", ".join(str(path) for path in selection.recordings)
             why = f" ({table.skipped[0]})" if table.skipped else ""
-            raise RecordingError(f"{names}: no {what} in the time that is wanted{why}")
+            timed = selection.from_ns is not None or selection.to_ns is not None
+            why = f" in the time that is wanted{why}" if timed else why
+            if what != "stream":
+                why += ": only a monitor records them; rotorwatch replay --offline computes them from the samples"
+            raise RecordingError(f"{names}: no {what}{why}")
     return table
 
 

@@ -179,6 +179,14 @@ def test_channels_that_change_are_exported_by_themselves(tmp_path: Path) -> None
         assert (sum(batch.num_rows for batch in table.batches), table.skipped) == (400, [])
 
 
+def test_a_recording_without_reports_says_what_makes_them(tmp_path: Path) -> None:
+    described = LAB.descriptor.model_dump_json().encode()
+    with RecordingWriter(tmp_path / "bare.mcap") as writer:
+        writer.write(RecordedMessage(LAB.keys.descriptor, described, b"", "application/json", START_NS, START_NS))
+    with pytest.raises(RecordingError, match=r"bare.mcap: no reports: only a monitor records them; rotorwatch replay"):
+        export(Selection((tmp_path / "bare.mcap",)), "reports", "csv", tmp_path / "out.csv")
+
+
 def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
     heavy = load_machine("heavy")
     recording(tmp_path / "a.mcap", blocks=2)

@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,24 @@ def test_the_doctor_sums_up_gaps_and_disconnected_sensors(tmp_path: Path) -> Non
         block.samples[:, 1] = np.nan
     (trouble,) = (one for one in troubles(iter(whole)) if "NDE-V" in one)
     assert trouble == "NDE-V: sent as NaN, the last time for 1.5 s, expected numbers: its sensor is not connected"
+
+
+def test_the_doctor_compares_clocks_and_reports_a_keyphasor_sent_as_volts(tmp_path: Path) -> None:
+    probe, keyphasor = "VE-1 displacement um shaft-end axial", "KPH shaft_angle rad shaft rotation"
+    run(*FAN, "--sensor", probe, "--sensor", keyphasor, "--folder", str(tmp_path))
+    machine = load_machine_file(tmp_path / "fan.toml")
+    messages = []
+    for block, _ in blocks(3.0):
+        volts = np.where(np.arange(len(block.samples)) % 100 < 5, -14.0, -7.0).astype(np.float32)
+        gap = np.full(len(block.samples), -1015.0, np.float32)
+        sent = replace(block, samples=np.column_stack([block.samples, gap, volts]).astype(np.float32))
+        messages.append(RecordedMessage(machine.keys.stream, *encode_block(sent, ""), sent.end_ns - 3600 * 10**9, 0))
+    found = examined(machine, messages)
+    assert any(one.endswith(", 3600 s ahead of this computer's clock") for one in found.lines), found.lines
+    assert any("VE-1 0 µm pp, gap -1015 µm" in one for one in found.lines), found.lines
+    (trouble,) = (one for one in found.troubles if "shaft angle" in one)
+    assert "it is between -14 and -7 rad" in trouble
+    assert "instead of an angle from 0 to 2 pi" in trouble
 
 
 def test_two_sensors_have_a_trend_after_init_run_and_plot(tmp_path: Path) -> None:

@@ -218,7 +218,7 @@ def test_append_only_tables_cannot_be_changed(store: Store, url: str, table: str
 
 def test_only_one_monitor_can_write_a_machine(store: Store, url: str) -> None:
     store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
-    with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
+    with pytest.raises(StoreError, match=r"another monitor writes the history of demo/lab: stop it, or"):
         store.machine("demo", "lab")
     with opened(url) as other:
         with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
