@@ -56,10 +56,8 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
 _OTHER_LOCATIONS = ("DE", "NDE", "casing")
 """Names of other places, which are never taken for a misspelt location of the model."""
-_TILT = "location 'disc', direction y or z"
-_EXPECTED = {
-    Quantity.SHAFT_ANGLE: "location 'shaft', direction 'rotation'", Quantity.TILT: _TILT, Quantity.TILT_RATE: _TILT,
-}  # fmt: skip
+_EXPECTED = dict.fromkeys((Quantity.TILT, Quantity.TILT_RATE), "location 'disc', direction y or z")
+_EXPECTED[Quantity.SHAFT_ANGLE] = "location 'shaft', direction 'rotation'"
 _EXPECTED_VIBRATION = (
     "location 'bearing' or 'disc', direction y or z (horizontal or vertical), or angle_deg; at places with other names "
     f"({', '.join(_OTHER_LOCATIONS)}, …), where the direction is free, only levels are watched"
@@ -122,8 +120,8 @@ class Channel(BaseModel, extra="forbid", frozen=True):
             return self
         known = self.location in _LOCATIONS
         hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
-        if not known and (self.location in _OTHER_LOCATIONS or not self.location.isalpha()):
-            hint = ""  # "bearing1" and "bearing DE" are names
+        if self.location in _OTHER_LOCATIONS or not self.location.isalpha():  # "bearing1" and "bearing DE" are names
+            hint = ""
         if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "

@@ -160,7 +160,7 @@ def _label(
     """Mark a point of a path, and write its speed or time beside it."""
     axes.plot(*place, "o", color=COLOURS[1], markersize=size, zorder=4)
     axes.annotate(
-        f"{value:.0f}" if unit.endswith("rpm") else f"{value:.3g}", place, xytext=offset,
+        f"{value:.0f}" if unit.endswith("rpm") else f"{round(value, 2):.3g}", place, xytext=offset,
         textcoords="offset points", fontsize=8, color=COLOURS[1], bbox=PLATE, zorder=5,
     )  # fmt: skip
 
@@ -190,7 +190,8 @@ def centreline(
         known = np.isfinite(path).all(axis=1)
         path, along = path[known], every[known]
         names = planes_of(pair).names
-        start = f"start: {names[0]} {path[0, 0]:.4g} µm, {names[1]} {path[0, 1]:.4g} µm"
+        y_um, z_um = (f"{name} {value:.4g} µm" for name, value in zip(names, path[0].tolist(), strict=True))
+        start = f"start: {y_um}," + (" " if len(y_um) < 24 else "\n") + z_um  # names of probes at an angle are long
         path = path - path[0]
         y, z = path.T
         lines = LineCollection(list(np.stack([path[:-1], path[1:]], axis=1)), cmap="viridis_r", norm=norm)

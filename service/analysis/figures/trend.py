@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from models.alarm_names import MODEL
 from models.errors import MachineFileError
@@ -86,13 +87,15 @@ def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
     handles: list[Patch | Line2D] = []
     if trend.parameters:
         handles.append(Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval"))
-    limits = trend.limits
-    near = any(np.isfinite(level.danger).any() for level in trend.levels)
-    if limits is not None or near:
-        near |= limits is not None and any(_danger_near(parameter, limits) for parameter in trend.parameters)
-        for severity in ("alert", "danger") if near else ("alert",):
-            colour = SEVERITY_COLOURS[severity]
-            handles.append(Line2D([], [], color=colour, linewidth=0.9, linestyle=_DASHES, label=f"{severity} limit"))
+    limits = trend.limits if trend.parameters else None
+    drawn = {
+        "alert": limits is not None or any(np.isfinite(level.alert).any() for level in trend.levels),
+        "danger": any(np.isfinite(level.danger).any() for level in trend.levels)
+        or (limits is not None and any(_danger_near(parameter, limits) for parameter in trend.parameters)),
+    }
+    for severity in (one for one, shown in drawn.items() if shown):
+        colour = SEVERITY_COLOURS[severity]
+        handles.append(Line2D([], [], color=colour, linewidth=0.9, linestyle=_DASHES, label=f"{severity} limit"))
     if trend.alarms:
         handles.append(Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, label="alarm raised"))
     if any(alarm.kind == "cleared" for alarm in trend.alarms):
@@ -189,6 +192,7 @@ def _level(axes: Axes, level: LevelTrend, trend: TrendSeries, step_ns: int) -> N
     known = values[np.isfinite(values)]
     if known.size:
         axes.set_ylim(0, 1.6 * float(known.max()) or 1.0)
+        axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
 def _measure(axes: Axes, name: str, trend: TrendSeries, step_ns: int) -> None:

@@ -23,8 +23,9 @@ from service.analysis.orbit import in_planes, orbit_pairs, recorded_pairs
 from service.analysis.recorded import Recorded
 from service.analysis.runup import read_centreline, read_run_up
 from service.analysis.spectrum import read_full_spectrum
+from tests.commissioning.rotor_kit import mounted
 from tests.service.rig.live import LAB, START_NS
-from tests.service.rig.replaying import S, machine_blocks, made, recorded, without_angle
+from tests.service.rig.replaying import S, machine_blocks, made, recorded, recording, without_angle
 
 RATE_HZ = LAB.rate_hz
 Signals = dict[str, Callable[[FloatArray], FloatArray]]
@@ -127,6 +128,20 @@ def test_probes_at_an_angle_are_turned_to_y_and_z() -> None:
     samples = np.stack([shown[one] for pair in pairs for one in pair], axis=1)
     for found, expected in zip(in_planes(samples, pairs), shaft.values(), strict=True):
         assert found == pytest.approx(np.stack([expected, expected], axis=1))
+
+
+def test_the_start_of_a_centreline_fits_beside_probes_at_an_angle(tmp_path: Path) -> None:
+    turned = mounted(LAB, {"y1": (45.0, 135.0), "y2": (45.0, 135.0)})
+    sensors = tuple(one.model_copy(update={"name": f"VT-{one.name}"}) for one in turned.sensors)
+    turned = turned.model_copy(update={"sensors": sensors})
+    signals: Signals = {name: lambda t: -1015.0 + 5.0 * np.sin(t) for name in ("y1", "z1", "y2", "z2")}
+    data = recorded(recording(tmp_path / "made.mcap", machine_blocks(signals, 20.0), turned))
+    figure = drawn(centreline(Look(), data, None, 1.0, None))
+    figure.draw_without_rendering()
+    texts = [(axes, text) for axes in figure.axes for text in axes.texts if text.get_text().startswith("start: ")]
+    assert len(texts) == 2
+    for axes, text in texts:
+        assert text.get_window_extent().x1 < axes.get_window_extent().x1
 
 
 CRITICAL_HZ, DAMPING, RATE_HZ_PER_S = 25.0, 0.05, 0.5
