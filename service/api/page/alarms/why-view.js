@@ -78,7 +78,7 @@ class WhyView extends HTMLElement {
   /** @param {AlarmEvidence} found @param {Parameter | undefined} read @param {import("../monitor/records.d.ts").Finding | undefined} finding @param {import("../monitor/records.d.ts").AlarmEventData | undefined} event */
   #sentence(found, read, finding, event) {
     const confidence = event?.evidence?.confidence ?? null;
-    if (!read || !finding) return `${event?.text ?? found.name}${event ? `, ${clock(event.time_ns)}` : ""}. ${found.raised.report.reason}`;
+    if (!read || !finding) return `${[event?.text ?? found.name, event && clock(event.time_ns), found.raised.report.reason].filter(Boolean).join("; ")}.`;
     const change = within(Number(read.relative_change), Z95 * Number(read.standard_error));
     const range = finding.between_ns ? ` (between ${clock(finding.between_ns[0])} and ${clock(finding.between_ns[1])})` : "";
     const sure = confidence === null ? "" : ` Probability that exactly this has changed: ${probability(confidence)}.`;
@@ -115,7 +115,7 @@ class WhyView extends HTMLElement {
     const { verdict, misfit_z: misfit } = after;
     const rpm = (/** @type {Report | undefined} */ report) => (report?.speed_rad_s ? `${((report.speed_rad_s * 30) / Math.PI).toFixed(0)} rpm` : "unknown");
     const model = verdict?.outside_model
-      ? `Not ruled out: the window is outside the model${after.suspect ? `, best explained by ${after.suspect}` : ""}. What is named has low confidence.`
+      ? `Not ruled out: the window is outside the model${after.suspect ? `, best explained by ${after.suspect}` : ""}.${verdict.changed.length ? " What is named has low confidence." : ""}`
       : misfit !== null && `Another kind of fault: the model explains the window (misfit ${figure(misfit)} standard deviations).`;
     const found = new Set(verdict?.changed.map((one) => one.name));
     const [also, others] = [true, false].map((changed) =>

@@ -207,7 +207,7 @@ class LineChart extends HTMLElement {
     for (const { text, place, upright, colour, below } of marks.sort((one, other) => Number(one.upright) - Number(other.upright))) {
       if (!text) continue;
       const wide = ctx.measureText(text).width;
-      const rows = upright ? [1, 2, 3, 4, 5, 6].map((row) => bbox.top + 4 * gap * row) : [place + (below && place + 5 * gap < bbox.top + bbox.height ? 4 : -1) * gap];
+      const rows = upright ? [1, 2, 3, 4, 5, 6].map((row) => bbox.top + 4 * gap * row) : [place + (below && place + 5 * gap < bbox.top + bbox.height ? 4 : -1.6) * gap];
       const from = upright ? [place + gap, place - gap - wide] : [bbox.left + gap, ...taken.map(({ to }) => to + 3 * gap)];
       const places = rows.flatMap((y) => from.map((x) => [x, y]));
       const found = places.find((each) => free(each, wide)) ?? (upright ? places[0] : null);

@@ -27,7 +27,7 @@ function limitsOf({ source, zones, alert, danger, fall }) {
 export class LevelTrend extends ReadingTrend {
   quantity = "level";
   title = "Levels over time";
-  note = " Zones and limits are those of the newest window.";
+  note = "the band reaches from the lowest to the highest. Zones and limits are those of the newest window.";
 
   async trended() {
     // Any change may affect every level.

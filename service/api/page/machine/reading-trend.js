@@ -15,8 +15,8 @@ const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 export class ReadingTrend extends MachineElement {
   quantity = "";
   title = "";
-  /** Remarks on the limits. */
-  note = "";
+  /** What the band shows, and remarks on the limits. */
+  note = "the band shows the 95 % intervals.";
   /** @type {number | null} */
   #oldest = null;
   /** @type {Map<string, any>} */
@@ -85,7 +85,7 @@ export class ReadingTrend extends MachineElement {
     const { shown, buckets, events } = this.#read;
     for (const one of shown) this.#draw(one, buckets.filter((bucket) => bucket.name === one.name), events);
     const ends = buckets.map((bucket) => bucket.start_ns + bucket.length_ns);
-    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for the mean of several; the band shows the 95 % intervals.${this.note}`;
+    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for the mean of several; ${this.note}`;
     this.#message.textContent = buckets.length ? "" : "Nothing has been read yet.";
   }
 

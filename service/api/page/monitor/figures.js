@@ -91,15 +91,14 @@ export function stretch(start_ns, end_ns) {
 }
 
 /**
- * Labels of times along an axis: date or time of day, as fine as the steps; empty for null.
+ * Labels of times along an axis: time of day as fine as the steps, or month and day as in other dates; empty for null.
  * @param {(number | null)[]} seconds
  * @param {number} step_s
  */
 export function ticks(seconds, step_s) {
-  const day = format({ month: "2-digit", day: "2-digit" });
   const time = format({ hour: "2-digit", minute: "2-digit", ...(step_s < 60 ? { second: "2-digit" } : {}) });
   const first = seconds.findIndex((each) => each !== null);
-  return seconds.map((each, at) => (each === null ? "" : (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === first ? `\n${day.format(each * 1e3)}` : "")));
+  return seconds.map((each, at) => (each === null ? "" : (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === first ? `\n${clock(each * 1e9).slice(5, 10)}` : "")));
 }
 
 /** A pause longer than this multiple of the shortest step between readings is a gap. */

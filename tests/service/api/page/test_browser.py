@@ -157,6 +157,7 @@ def test_a_fault_is_shown_explained_and_acknowledged(browser: Browser, plant: Pl
         second.route("**/evidence*", _of_a_damaged_bearing)
         second.reload()
         expect(second.locator("why-view tr.danger")).to_have_text("envelope– m/s² rms0.3 m/s² rmsdanger limit 0.2")
+        expect(second.locator(".verdict")).to_have_text(re.compile(r"; 2026-01-01 00:0\d:\d\d UTC(; .+[^.])?\.$"))
 
         plant.cut.set()
         page.goto(f"{url}/#/")
@@ -236,6 +237,7 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
         page.goto(f"{url}/#/machines/demo/lab")
         trend = page.locator("level-trend")
         expect(trend.locator("figcaption")).to_contain_text("rigid: A to 1.4, B to 2.8, C to 4.5 m/s² rms, D beyond")
+        expect(trend).to_contain_text("the band reaches from the lowest to the highest. Zones and limits are")
         expect(trend.locator(".u-legend")).to_contain_text(re.compile(r"time\s*2026-01-01 00:03:25 UTC\s*mean\s*3.3"))
         assert {"zone A", "zone B", "zone C", "zone D", "alert", "danger"} <= set(page.evaluate("window.written"))
         fold = page.locator("level-table summary")

@@ -125,3 +125,15 @@ def test_a_narrow_interval_is_not_rounded_to_zero(tmp_path: Path) -> None:
     )
     done = run_deno(tmp_path, "run", str(script))
     assert done.stdout == "−20.0 % ± 0.1 %,−19.999 % ± 0.039 %,−19.9990 % ± 0.0024 %\n", done.stderr
+
+
+def test_dates_along_an_axis_have_the_order_of_other_dates(tmp_path: Path) -> None:
+    script = tmp_path / "ask.js"
+    figures = STATES.with_name("figures.js").as_uri()
+    script.write_text(
+        "globalThis.localStorage = { getItem: () => null };\n"
+        f'const {{ ticks }} = await import("{figures}");\n'
+        "console.log(JSON.stringify([ticks([null, 1796014440, 1796014500], 60), ticks([1795996800], 86400)]));"
+    )
+    done = run_deno(tmp_path, "run", "--allow-read", str(script))
+    assert json.loads(done.stdout) == [["", "04:54\n11-30", "04:55"], ["\n11-30"]], done.stderr
