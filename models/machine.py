@@ -385,7 +385,10 @@ def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFil
         Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
-    found = checked(MachineFile, changed(read_toml(path), changes), path)
+    fields = changed(read_toml(path), changes)
+    if "machines" in fields:
+        raise MachineFileError(f"{path}: is a settings file, expected a machine file")
+    found = checked(MachineFile, fields, path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
     return Machine.model_validate(found.model_dump() | {"operation": found.operation})  # keeps which fields were given

@@ -332,7 +332,7 @@ def _unknown(key: str, above: _Place, model: type[BaseModel], fields: object) ->
 
 def _tables(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
     """All tables a file may have, and where they are."""
-    yield (f"into [{path}]" if path else "to the top of the file"), model
+    yield (f"in [{path}]" if path else "at the top of the file"), model
     for name, info in model.model_fields.items():
         for below in _models(info.annotation):
             yield from _tables(below, f"{path}.{name}" if path else name)

@@ -296,6 +296,12 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     fields = {} if path is None else read_toml(path)
     if path is not None and not fields:  # left by an editor on a full disk, for example
         raise MachineFileError(f"{path}: is empty, expected settings (TOML)")
+    for table, kind in (
+        ("sensors", "machine file, to be named in [[machines]]"),
+        ("channels", "mapping for an import"),
+    ):
+        if table in fields:
+            raise MachineFileError(f"{path}: is a {kind}, expected settings")
     place = Path("default settings") if path is None else path
     told = [f"{place}: {text}" for text in unseen_mistakes(fields, ServiceSettings)]
     try:
