@@ -190,9 +190,13 @@ class LevelJudge:
         if channel is None or not most:
             return Foreign()
         healthy = state.kurtosis[channel.name].mean
-        how = "clipped, as by a rub" if most < 0 else "with impacts, as from a rub, a loose part or a damaged bearing"
+        how = (
+            "that is clipped, as by a rub"
+            if most < 0
+            else "with impacts, as from a rub, a loose part or a damaged bearing"
+        )
         return Foreign(
-            f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
+            f"a vibration at {channel.name} ({channel.location} {channel.direction}) {how}: kurtosis of its "
             f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
         )
 
