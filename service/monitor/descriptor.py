@@ -42,7 +42,7 @@ def _differences(announced: bytes, machine: MachineFile) -> list[str]:
         if getattr(found, field) != getattr(expected, field)
     ]
     if len(found.channels) != len(expected.channels):
-        differences.append(f"channels has {len(found.channels)} entries, expected {len(expected.channels)}")
+        differences.append(f"the number of channels is {len(found.channels)}, expected {len(expected.channels)}")
     for number, (theirs, ours) in enumerate(zip(found.channels, expected.channels, strict=False)):
         for field in ("name", "quantity", "location", "direction", "unit", "angle_deg"):
             is_, should = str(getattr(theirs, field)), str(getattr(ours, field))

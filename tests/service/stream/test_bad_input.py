@@ -121,6 +121,11 @@ def test_a_bad_block_is_refused_and_the_next_accepted(fed: tuple[Runtime, Machin
         ('"dtype":"float32"', '"dtype":"float64"', "dtype is 'float64', expected 'float32'"),
         ('"machine":"lab"', '"machine":"pump"', "machine is 'pump', expected 'lab'"),
         ('"unit":"mm/s"', '"unit":"m/s"', "channels.2.unit (y1_dot) is 'm/s', expected 'mm/s'"),
+        (
+            '{"name":"y1","quantity":"displacement","location":"bearing","direction":"y","unit":"um"},',
+            "",
+            "the number of channels is 8, expected 9",
+        ),
         ('"rate_hz":2000.0', '"rate_hz":"fast"', "descriptor cannot be read: rate_hz: expected a number"),
     ],
 )
