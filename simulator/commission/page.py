@@ -15,6 +15,7 @@ from models.commissioning.commission import CommissioningReport
 from models.commissioning.commissioned import Commissioned, KnowledgeLevel
 from models.commissioning.healthy import HealthyRecording
 from models.errors import RecordingError
+from models.levels.limits import MEASURE_WORDS
 from models.machine import MachineFile
 from models.signals.channels import unit_in_text
 from simulator.commission import verdict
@@ -201,7 +202,7 @@ def _growths(report: CommissioningReport) -> tuple[tuple[str, ...], ...]:
         unit = unit_in_text(one.unit)
         healthy, alert = (f"{verdict.significant(edge, 3)} {unit}" for edge in (one.healthy, one.alert))
         growth = "–" if one.growth is None else f"{100 * one.growth:.0f}%"
-        found.append((state, str(one.windows), one.channel, one.measure, healthy, alert, growth))
+        found.append((state, str(one.windows), one.channel, MEASURE_WORDS[one.measure], healthy, alert, growth))
     return tuple(found)
 
 

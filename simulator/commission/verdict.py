@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 
 from models.commissioning.commission import CommissioningReport, ParameterSummary
+from models.levels.limits import MEASURE_WORDS
 
 _PLACES = {
     "y1": "bearing, horizontal",
@@ -253,7 +254,8 @@ def growth_sentence(report: CommissioningReport) -> str:
         return ""
     (least, first), (most, last) = (edge(found, key=lambda each: each[0]) for edge in (min, max))
     low, high = f"{100 * least:.0f}%", f"{100 * most:.0f}%"
-    ends = f"{low} ({first.channel} {first.measure}) to {high} ({last.channel} {last.measure})"
+    at_least, at_most = (f"{one.channel} {MEASURE_WORDS[one.measure]}" for one in (first, last))
+    ends = f"{low} ({at_least}) to {high} ({at_most})"
     return (
         "A level raises an alert, relative to the healthy machine, once it has grown by "
         f"{low if low == high else ends}. A load that is not in the recordings, stronger or from another direction, "

@@ -16,6 +16,7 @@ from rich.console import Console
 from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary
 from models.commissioning.healthy import HealthyRecording
 from models.errors import RecordingError
+from models.levels.limits import MEASURE_WORDS
 from models.machine import MachineFile, Operation
 from simulator.commission.command import print_report
 from simulator.commission.page import HTML, JSON, write_report
@@ -428,7 +429,7 @@ def test_the_growth_that_raises_an_alert_is_on_the_page_and_in_the_terminal(fold
         assert one.growth >= 0.6 - 1e-9  # 1.6 times the healthy level, or further
         assert one.alert == pytest.approx(one.healthy * (1 + one.growth))
         assert one.windows > 0
-        assert f"{one.channel} {one.measure} " in told
+        assert f"{one.channel} {MEASURE_WORDS[one.measure]} " in told
         assert f"{100 * one.growth:.0f}%" in told
     out = printed(report, 400)
     assert "not in the recordings, stronger or from another direction, makes some channels louder" in out

@@ -215,7 +215,7 @@ def _frame(axes: Axes, names: tuple[str, str], start: str, path: FloatArray, cle
     """Set limits with equal scales on both axes, and state the start position."""
     if clearance_um is not None:
         start += f"\ncircle: clearance of {clearance_um:g} µm, if the shaft lies at its bottom to begin with"
-    frame_plane(axes, names, "µm from the start", start, bbox=PLATE, zorder=6)
+    frame_plane(axes, names, "µm from the start", start)
     half = clearance_um / 2 if clearance_um else 0.0
     left, bottom = np.minimum(path.min(axis=0), (-half, 0.0)).tolist()
     right, top = np.maximum(path.max(axis=0), (half, 2 * half)).tolist()

@@ -132,7 +132,7 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
 
 def _frame(axes: Axes, orbit: Orbit, path: tuple[np.ndarray, np.ndarray], lines: list[str]) -> None:
     """Set both axes to the extent of the path, with room above for the text."""
-    frame_plane(axes, orbit.names, "µm", "\n".join(lines), zorder=5)
+    frame_plane(axes, orbit.names, "µm", "\n".join(lines))
     reach = 1.12 * max(float(np.max(np.abs(path))), 1e-6)
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, 1.35 * reach)

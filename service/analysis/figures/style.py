@@ -124,14 +124,16 @@ def place_text(channel: Channel) -> str:
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
-def frame_plane(axes: Axes, names: tuple[str, str], unit: str, text: str, **style: Any) -> None:
+def frame_plane(axes: Axes, names: tuple[str, str], unit: str, text: str) -> None:
     """Give the axes y and z one scale, label them with names of sensors or of `planes_of`, and write a text inside."""
     for axis, way, name in zip((axes.xaxis, axes.yaxis), "yz", names, strict=True):
         axis.set_label_text(f"{name if ' of ' in name else f'{way}: {name}'}, {unit}")
     axes.axhline(0, color=GREY, linewidth=0.6)
     axes.axvline(0, color=GREY, linewidth=0.6)
     axes.set_aspect("equal")
-    axes.text(0.02, 0.985, text, transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, **style)
+    axes.text(
+        0.02, 0.985, text, transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, bbox=PLATE, zorder=6
+    )
 
 
 def rotation_text(direction: int) -> str:
