@@ -102,8 +102,8 @@ def health(  # noqa: PLR0913  # what the worker counts
     since_ns = stream.silent_since_ns
     since = "the monitor started" if since_ns is None else f"{rfc3339(since_ns)[:19]}Z"
     silence, quality = f"no data since {since}" if stream.silent else "", record.quality
-    if silence and quality.last_refusal and not quality.accepted_blocks:
-        silence += f", every block was refused: {quality.last_refusal}"
+    if silence and record.refused:
+        silence += f", blocks are refused: {quality.last_refusal}"
     if unread_messages:
         refused = quality.refused_blocks | {"unread": unread_messages}
         quality = quality.model_copy(update={"refused_blocks": refused})

@@ -71,7 +71,7 @@ class MachineMonitor:
             ("gate", self._gate), ("evaluator", reporter.evaluator), ("standstill", reporter.standstill),
             ("data_path", self._data_path), ("missing", self._missing),
         )  # fmt: skip
-        self._quality, self._accepted = Quality(), 0
+        self._quality, self._accepted, self._refused = Quality(), 0, False
         self._latest: Report | None = None
         self.end_ns: int | None = None
         self._reached_ns: int | None = None
@@ -316,6 +316,7 @@ class MachineMonitor:
             self.alarms.next_sequence - 1,
             self._fault or ("" if self._latest is None else self._latest.reason),
             self.end_ns,
+            self._refused,
         )
 
     def _admission_of(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
@@ -339,6 +340,7 @@ class MachineMonitor:
 
     def _count(self, verdict: Admission) -> Admission:
         self._accepted += verdict.accepted
+        self._refused = not verdict.accepted
         if not verdict.continuous:
             self._quality = counted(self._quality, verdict)
         return verdict

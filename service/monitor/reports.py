@@ -91,6 +91,7 @@ class MachineHealth:
     sequence: int = -1  # number of the latest alarm event
     reason: str = ""  # why nothing is said of the machine; empty if something is
     end_ns: int | None = None  # end of the newest data; None before the first
+    refused: bool = False  # whether the newest block was refused
 
 
 @dataclass(slots=True)

@@ -2,6 +2,7 @@
 
 import json
 import platform
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -124,17 +125,19 @@ def test_new_data_end_a_silence_and_refused_blocks_do_not(tmp_path: Path) -> Non
         assert worker.health().stream.silent_since_ns is None
         assert worker.health().stream.data_age_s is None
         feed.put(feed.block(rate_hz=2048.0))
-        told = "no data since the monitor started, every block was refused: "
+        told = "no data since the monitor started, blocks are refused: "
         until(lambda: worker.health().reason.startswith(told), "refusal")
         feed.put_good()
         until(lambda: worker.health().state == "warming", "end of the silence")
         until(lambda: worker.health().state == "no-data", "silence")
+        assert re.fullmatch(r"no data since \S+Z", worker.health().reason)  # an earlier refusal is none of its causes
         # Refused blocks do not count as data.
         accepted = worker.health().quality.accepted_blocks
         for _ in range(3):
             feed.put(feed.block(samples=np.full((200, 9), np.nan, dtype=np.float32)))
         until(lambda: worker.health().quality.refused_blocks == {"rate": 1, "not-finite": 3}, "refusals")
         assert (worker.health().state, worker.health().quality.accepted_blocks) == ("no-data", accepted)
+        assert re.match(r"no data since \S+Z, blocks are refused: demo/lab: block", worker.health().reason)
 
 
 class _Poisoned(MachineMonitor):
