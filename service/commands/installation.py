@@ -1,6 +1,7 @@
 """``rotorwatch init`` and ``rotorwatch doctor``: set up a machine, and check what arrives from it."""
 
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -132,10 +133,11 @@ def _asked_sensors() -> list[str]:
 
 def _sensor(line: str) -> dict[str, str]:
     words = line.split()
-    if len(words) not in {len(_SENSOR), len(_SENSOR) + 1}:
+    angle = words[len(_SENSOR) :]
+    if len(words) < len(_SENSOR) or len(angle) > 1 or (angle and not re.fullmatch(r"[-+.\d]+", angle[0])):
         raise MachineFileError(
             f"--sensor {line!r} has {len(words)} words, expected {len(_SENSOR)}: {' '.join(_SENSOR)}, "
-            f"such as '{_EXAMPLE}', or an {_ANGLE} besides"
+            f"such as '{_EXAMPLE}', and besides at most a number, the {_ANGLE}"
         )
     return dict(zip((*_SENSOR, _ANGLE), words, strict=False))
 

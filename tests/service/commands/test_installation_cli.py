@@ -83,6 +83,7 @@ def test_init_writes_files_that_other_commands_accept(tmp_path: Path) -> None:
         (("init",), "--site is missing, and there is no terminal to ask for it"),
         (("init", "--site", "plant", "--name", "fan", "--sensor", "a b c d e"), "--rate-hz is missing"),
         ((*FAN, "--sensor", "DE-A acceleration"), "has 2 words, expected 5"),
+        ((*FAN, "--sensor", "DE-A acceleration g rms DE axial"), "has 6 words, expected 5"),
         ((*FAN, "--sensor", "DE-A acceleration G DE axial"), "did you mean g"),
         ((*FAN, "--snapshots", "10"), "--snapshots '10' has 1 words, expected two, such as '0.1 10'"),
         ((*FAN, "--snapshots", "10 5"), "on_s 10 must be below every_s 5"),
