@@ -27,6 +27,7 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
 
 _OR_STIFFNESS = "or the stiffness there has changed, which looks the same well below its resonance"
+_TOO_LITTLE = "something changed within the window, and data since then are too few to say what"
 _MOST_MISFIT_Z = 2.0  # standard deviations of the misfit within which nothing has to be explained
 
 Newest = tuple[SlidingWindow, SequentialTest]
@@ -47,15 +48,18 @@ class Evaluation:
     gyroscopic: Literal["", "opposite"] = ""  # sense of the gyroscopic moments where it is not that of Eq. (27)
     alone: bool = False  # whether only later windows can show that this one straddles a change
 
-    def calm(self, *, outside: bool, without: bool = False) -> HealthState:
+    def calm(self, *, outside: bool, told: bool, without: bool = False) -> HealthState:
         """State if no alarm is raised: healthy only if a parameter was read that could have shown a change.
 
-        If the window was evaluated `without` faulty sensors, their fault takes precedence.
+        If the window was evaluated `without` faulty sensors, their fault takes precedence. If the verdict has no
+        readings (`told`), there are too few data since a change.
         """
         if outside:
             return HealthState.OUTSIDE_MODEL
         if without:
             return HealthState.DATA_HEALTH
+        if not told and (self.deciding.evaluable or self.deciding.unexplained):
+            return HealthState.WARMING
         if self.deciding.evaluable:
             return HealthState.HEALTHY
         states = {shape.verdict for shape in self.shapes}
@@ -109,7 +113,7 @@ class Evaluation:
         If the verdict has readings (`told`), an unexplained window needs no reason: it straddles the change.
         """
         if self.deciding.unexplained or self.deciding.evaluable:
-            return "" if told else self.deciding.unexplained
+            return "" if told else self.deciding.unexplained or _TOO_LITTLE
         reasons = (one.reason for one in self.deciding.parameters if one.reason)
         return "; ".join(dict.fromkeys([*self._changed, *reasons]))
 

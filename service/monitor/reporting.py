@@ -115,22 +115,22 @@ class WindowReporter:
         )
         evaluation = evaluation.named(self._machine.sensors, statistics, foreign.text, faulty)
         looks = {n: stretch_of(one, samples.hops[-n].start_ns, end_ns) for n, one in evaluation.short.items()}
-        whole = test.settings.window_hops
-        looks[whole] = stretch_of(evaluation.deciding, start_ns, end_ns)
+        deciding, whole = evaluation.deciding, test.settings.window_hops
+        looks[whole] = stretch_of(deciding, start_ns, end_ns)
         verdict = test.update(looks, foreign=foreign.text != "", rivals=evaluation.rivals(foreign))
-        unexplained, suspect = evaluation.deciding.unexplained, evaluation.deciding.suspect
+        look, limits = looks[whole].complete(), test.settings.thresholds(whole)
         astride_s = test.astride_s if evaluation.alone and not foreign.text else 0.0
         verdict, rival = self._beside_rivals(verdict)
         explains = self._alarms.found(
-            verdict, test.unexplained, suspect, end_ns, astride_s, hidden=foreign.hides, rival=rival
+            verdict, test.unexplained, deciding.suspect, end_ns, astride_s, hidden=foreign.hides, rival=rival
         )
         levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
-        reason = evaluation.reason(told=bool(verdict.current))
         if evaluation.shapes:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
-        look, length_s = looks[whole].complete(), self._machine.window.length_s
-        calm = evaluation.calm(outside=verdict.outside_model, without=faulted)
+        read = bool(verdict.current)
+        calm = evaluation.calm(outside=verdict.outside_model, told=read, without=faulted)
+        reason = evaluation.reason(told=read)
         if not self._plan.states and levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         return Report(
@@ -141,10 +141,10 @@ class WindowReporter:
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             gyroscopic=evaluation.gyroscopic,
-            misfit_z=evaluation.deciding.misfit_z,
-            suspect=suspect if verdict.outside_model or foreign.hides else "",
+            misfit_z=deciding.misfit_z,
+            suspect=deciding.suspect if verdict.outside_model or foreign.hides else "",
             verdict=verdict,
-            detectable=() if unexplained else detectable_changes(look, test.settings.thresholds(whole), length_s),
+            detectable=() if deciding.unexplained else detectable_changes(look, limits, self._machine.window.length_s),
             reason=reason,
             shapes=evaluation.shapes,
         )

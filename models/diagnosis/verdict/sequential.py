@@ -202,7 +202,7 @@ class SequentialTest:
         findings = () if unexplained else self.state.findings
         either = foreign and not outside and findings != () and {one.name for one in findings} <= set(rivals)
         isolation = replace(isolation, outside=outside or (foreign and not either), outside_confidence=confidence)
-        detected = bool(verdicts) and not unexplained
+        detected = by is None or (bool(verdicts) and not unexplained)
         return Verdict(
             changed=findings,
             text=_in_words(findings, isolation, detected=detected, read=current) + either * _EITHER,

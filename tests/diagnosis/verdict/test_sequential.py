@@ -283,11 +283,15 @@ def with_misfits(looks: dict[int, Stretch], short_z: float, window_z: float) -> 
 def test_a_window_that_mixes_two_conditions_is_not_outside_the_model(short_z: float) -> None:
     """As after a change of the forces' colour; a machine outside the model shows in later short stretches as well."""
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 49)
-    said = []
+    said, undecided = [], []
     for misfits in (False,) * 20 + (True,) * 10 + (False,) * 10:
         looks = with_misfits(hops.looks(true()), short_z * misfits, 8.0 * misfits)
         if looks:
-            said.append(test.update(looks).outside_model)
+            verdict = test.update(looks)
+            said.append(verdict.outside_model)
+            undecided.append((verdict.detected, verdict.current == (), verdict.text))
+    assert set(undecided[:9]) == {undecided[0]}
+    assert undecided[9:11] == [(True, True, "something has changed; too little data yet to say what")] * 2
     assert said[:11] == [False] * 11
     assert said[11:19] == [short_z > 0.0] * 8
     assert said[19:] == [False] * 10

@@ -203,6 +203,17 @@ def test_a_jump_of_the_phase_reference_is_never_an_unbalance() -> None:
     assert target.health().state is HealthState.HEALTHY
 
 
+def test_just_after_a_change_a_machine_is_not_called_healthy() -> None:
+    windows, _ = feed(watching(), stream(90.0, Event(at_s=65.0, parameter="k_by", relative_change=-0.25))[650:])
+    states = [one.state for one in windows]
+    assert states == [HealthState.HEALTHY, HealthState.WARMING, HealthState.WARMING, *[HealthState.ALERT] * 2]
+    assert {one.reason for one in windows[1:3]} == {
+        "something changed within the window, and data since then are too few to say what"
+    }
+    assert {one.reason for one in windows[3:]} == {""}
+    assert windows[1].reason == "something changed within the window, and data since then are too few to say what"
+
+
 @pytest.mark.long  # in short, a stepping load is read from the segments of a window
 def test_a_step_of_the_load_is_inside_the_model() -> None:
     windows, events = feed(monitor(), stream(95.0, Event(at_s=65.0, excitation_level=3.0)))
