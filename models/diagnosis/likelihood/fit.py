@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 
 from models.checkpoint import checked, prefixed, texts, unprefixed
+from models.diagnosis.likelihood.dispersion import dispersion_of
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, unexplained_at, unseen
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
@@ -219,11 +220,12 @@ class LikelihoodFit:
                 f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
             ) from error
         self._last, self._strengths = found.theta, weights.strengths
-        why, nowhere = unexplained_at(model, weights, found.whitened, states)
+        dispersion = dispersion_of(model, weights, found, window.segments)
+        why, nowhere = unexplained_at(model, weights, found.whitened, states, dispersion=dispersion)
         unexplained = self._stated(why)
         if nowhere:
             raise UnexplainedError(unexplained)
-        goodness = goodness_of_fit(model, weights, found, states)
+        goodness = goodness_of_fit(model, weights, found, states, dispersion)
         self._misfits = self._misfits + 1 if goodness.misfit_z > MOST_MISFIT else 0
         if not unexplained and goodness.misfit_z > MOST_MISFIT:
             unexplained = self._stated(unseen(model, weights, found, goodness.misfit_z))

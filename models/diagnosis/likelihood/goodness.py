@@ -31,11 +31,14 @@ _OTHER_PLANE = str.maketrans("yz", "zy")
 _LEAST_INFORMATION = 1e-4
 
 
-def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> Goodness:
+def goodness_of_fit(
+    model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray, dispersion: float = 1.0
+) -> Goodness:
     """Test the alternatives at the maximum of one window.
 
     `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); with them,
-    displacement and velocity are also compared with each other.
+    displacement and velocity are also compared with each other. The spectra scatter by `dispersion` times the variance
+    that Gaussian excitation gives them.
     """
     names, slopes = _alternatives(model, found)
     score, left, told, _ = beyond_parameters(model, weights, found, slopes)
@@ -48,13 +51,20 @@ def goodness_of_fit(model: SpectralModel, weights: Weights, found: Maximum, stat
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
     # The two gains of a pair are nearly one test, and a pair's mismatch is hardly random; the total excess adds one.
     tests = len(alternatives) - len(pairs) + 1
-    # Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² minus its expectation where the model holds, and its standard deviation. The groups give the
-    # scatter of every element; each fitted parameter takes one off the sum.
+    total, expected, scatter = total_excess(model, weights, found)
+    over = total - dispersion * expected
+    return Goodness(over / (dispersion * scatter), (*alternatives, *pairs), tests, over)
+
+
+def total_excess(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[float, float, float]:
+    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖², and its expectation and standard deviation where the model holds.
+
+    The groups give the scatter of every element; each fitted parameter takes one off the sum.
+    """
     shared, excess = model.groups.shared, found.whitened.excess
     total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
-    over = total - (model.n**2 * float(np.trace(shared)) - found.fitted)
     scatter = float(model.n * np.sqrt(2 * np.sum(shared**2)))
-    return Goodness(over / scatter, (*alternatives, *pairs), tests, over)
+    return total, model.n**2 * float(np.trace(shared)) - found.fitted, scatter
 
 
 def beyond_parameters(
@@ -176,16 +186,21 @@ MOST_MISFIT, _BLIND = 4.0, 10.0
 
 
 def unexplained_at(
-    model: SpectralModel, weights: Weights, reached: Whitened, states: ComplexArray, times: float = 1.0
+    model: SpectralModel,
+    weights: Weights,
+    reached: Whitened,
+    states: ComplexArray,
+    times: float = 1.0,
+    dispersion: float = 1.0,
 ) -> tuple[str, bool]:
     """Why readings at this point mean nothing, else empty; and whether nothing in the model comes near the window.
 
     `states` are the estimated cross-spectra of the states, SI, shape (n_groups, n_states, n_states); the limits are
-    multiplied by `times`.
+    multiplied by `times`. For `dispersion` see `goodness_of_fit`.
     """
     excess, point, bins = reached.excess, reached.point, model.groups.bins
     squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2
-    deviation = max(0.0, float(np.mean(squared - 1 / weights.averages))) ** 0.5
+    deviation = max(0.0, float(np.mean(squared - dispersion / weights.averages))) ** 0.5
     far = bool(np.mean(weights.averages * squared) > times * _MOST_EXCESS)
     worst = int(np.argmax(np.abs(point.theta[: len(STRUCTURAL)])))
     log_ratio = float(point.theta[worst])

@@ -305,4 +305,5 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
         correlation=correlation,
         hop_correlation=np.repeat(correlation[np.newaxis], hops, axis=0),
         spectrum=spectrum,
+        segments=window.segments * turn[:, None],
     )

@@ -59,7 +59,6 @@ class SequentialSettings:
     # Standard error of every parameter that more windows do not remove: an estimate relative to nominal values does not
     # become exact however long it is averaged.
     systematic: float = 0.002
-    reach_s: float = 0.0  # how far before a stretch its first segment begins
 
     @classmethod
     def for_machine(
@@ -74,7 +73,6 @@ class SequentialSettings:
             window_hops=machine.window.hops,
             short_hops=tuple(hops for hops in _SHORT_HOPS if short and hops < machine.window.hops),
             false_alarms_per_month=machine.alarms.false_alarms_per_month if per_month is None else per_month,
-            reach_s=machine.window.segment_s / 2,
         )
 
     @property
@@ -175,8 +173,6 @@ class SequentialTest:
             own[windows * window_hops] = total.blurred(self.settings.systematic)
         own[window_hops] = looks[window_hops]
         self._watch_for_contradiction(own)  # without the shared error, which makes none contradict another
-        tested = any(hops < window_hops and look.misfit_z is not None for hops, look in own.items())
-        self._watch_for_misfit(own[window_hops], short=tested)
         every = {hops: look.complete().believed() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
@@ -293,17 +289,6 @@ class SequentialTest:
                     if not longer.unexplained:
                         self.state.before = tuple(whole[0].tolist())
                     return
-
-    def _watch_for_misfit(self, window: Stretch, *, short: bool) -> None:
-        """Date a change if the window begins to misfit, or is unexplained, and `short` stretches are tested as well.
-
-        It may mix two conditions of a healthy machine, such as colours of its forces: whether the machine is outside
-        the model is said by data from now on. They say so soon, as they hold more of what has changed.
-        """
-        state, limits = self.state, self._thresholds(self.settings.window_hops)
-        misfit = [one.unexplained != "" or model_test(one, limits)[0] for one in (*state.sums[1][-2:-1], window)]
-        if short and misfit == [False, True] and state.outside_ns is None and self._is_clean(window):
-            state.change_ns, state.dated_ns = window.end_ns + round(self.settings.reach_s * 1e9), window.end_ns
 
     def _decide(
         self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]

@@ -60,6 +60,7 @@ class WindowStatistics:
     # scatter gives standard errors
     hop_correlation: FloatArray
     spectrum: ComplexArray  # (n_bins, n, n), Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz
+    segments: ComplexArray  # (n_bins, n_segments, n), Fourier coefficients whose products `spectrum` is the mean of
     frequencies_hz: FloatArray  # (n_bins,), their frequencies
     synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
     hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone; 0 without a quarter turn
@@ -110,6 +111,7 @@ class WindowStatistics:
             correlation=self.correlation[..., kept, :][..., kept],
             hop_correlation=self.hop_correlation[..., kept, :][..., kept],
             spectrum=self.spectrum[:, kept][:, :, kept],
+            segments=self.segments[:, :, kept],
             phase_kept=None if self.phase_kept is None else self.phase_kept[:, kept],
             waveforms=(),
             sensors=(),
@@ -288,6 +290,7 @@ def window_statistics(
         correlation=correlation,
         hop_correlation=hop_correlation,
         spectrum=divided(spectrum, evaluated.shape[1]),
+        segments=evaluated,
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
@@ -357,6 +360,7 @@ def _equalised(window: WindowStatistics, equaliser: Equaliser, by_bin: ComplexAr
         correlation=window.correlation + missing.mean(axis=0),
         hop_correlation=window.hop_correlation + missing,
         spectrum=window.spectrum / (response[:, :, np.newaxis] * response[:, np.newaxis].conj()),
+        segments=window.segments / response[:, np.newaxis],
         synchronous=None if window.synchronous is None else window.synchronous / at_speed,
         hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous / at_speeds,
         relative_synchronous=None if relative is None else relative_vectors(relative / at_speeds),
@@ -374,6 +378,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
         correlation=turn @ window.correlation @ turn.T,
         hop_correlation=turn @ window.hop_correlation @ turn.T,
         spectrum=turn @ window.spectrum @ turn.T,
+        segments=window.segments @ turn.T,
         relative_synchronous=None if relative is None else relative_vectors(relative),
         lines=tuple(line.turned(turn) for line in window.lines),
         mounted=window.as_mounted,
