@@ -1,8 +1,8 @@
 """Writes steps of several machines in one transaction."""
 
 import math
-from collections import ChainMap, defaultdict
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -16,7 +16,7 @@ from service.history.records import StoredEvent, StoreError
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, machines, reports, series, windows
 from service.history.windows import READING, fill_buckets, packed
 
-SeriesNumbers = dict[tuple[int, str, str], int]
+SeriesNumbers = dict[int, Mapping[tuple[str, str], int]]
 _Rows = defaultdict[Table, list[dict[str, Any]]]
 
 # Built once: building them for every step takes nearly as long as executing them.
@@ -49,7 +49,7 @@ def write_group(
     Parameters
     ----------
     known : dict
-        Numbers of series by machine, quantity and name, as far as they have been looked up.
+        Numbers of series by machine, then by quantity and name, as far as they have been looked up.
 
     Returns
     -------
@@ -80,8 +80,8 @@ def write_group(
             of | asdict(report) | {"number": number, "recorded_ns": recorded_ns, "text": packed}
             for number, (recorded_ns, report, packed) in enumerate(bundle.reports, machine.reports + 1)
         ]
-        numbers = ChainMap(new_series, known)
-        _add_series(connection, claim.machine_id, bundle, numbers)
+        numbers = _numbers(connection, claim.machine_id, bundle, known.get(claim.machine_id, {}))
+        new_series[claim.machine_id] = numbers
         new = _new_windows(claim.machine_id, bundle, machine.windows + 1, numbers)
         rows[windows] += new
         # Windows wait until the bucket of their time is complete, which is when a window of another bucket comes.
@@ -128,28 +128,28 @@ def _new_events(connection: Connection, claim: Claim, events: Sequence[StoredEve
     return list(new.values())
 
 
-def _add_series(
-    connection: Connection, machine_id: int, bundle: StepBundle, numbers: MutableMapping[tuple[int, str, str], int]
-) -> None:
-    """Look up the numbers of the bundle's series, and give numbers to new ones."""
-    wanted = {(machine_id, each.quantity, each.name) for _, step in bundle.readings for each in step}
-    if wanted <= numbers.keys():
-        return
-    of_machine = select(series.c.quantity, series.c.name, series.c.series_id).where(series.c.machine_id == machine_id)
-    numbers.update({(machine_id, row.quantity, row.name): row.series_id for row in connection.execute(of_machine)})
-    if missing := sorted(wanted - numbers.keys()):
-        rows = [{"machine_id": machine_id, "quantity": quantity, "name": name} for _, quantity, name in missing]
+def _numbers(
+    connection: Connection, machine_id: int, bundle: StepBundle, known: Mapping[tuple[str, str], int]
+) -> Mapping[tuple[str, str], int]:
+    """Numbers of a machine's series; those of the bundle that have none get one."""
+    wanted = {(each.quantity, each.name) for _, step in bundle.readings for each in step}
+    if wanted <= known.keys():
+        return known
+    query = select(series.c.quantity, series.c.name, series.c.series_id).where(series.c.machine_id == machine_id)
+    there = {(row.quantity, row.name) for row in connection.execute(query)}
+    if missing := sorted(wanted - there):
+        rows = [{"machine_id": machine_id, "quantity": quantity, "name": name} for quantity, name in missing]
         connection.execute(insert(series), rows)
-        numbers.update({(machine_id, row.quantity, row.name): row.series_id for row in connection.execute(of_machine)})
+    return {(row.quantity, row.name): row.series_id for row in connection.execute(query)}
 
 
 def _new_windows(
-    machine_id: int, bundle: StepBundle, number: int, numbers: Mapping[tuple[int, str, str], int]
+    machine_id: int, bundle: StepBundle, number: int, numbers: Mapping[tuple[str, str], int]
 ) -> list[dict[str, Any]]:
     """Group readings of one time as windows, numbered from `number` on; a series that recurs begins another one."""
     made: list[tuple[dict[str, int], dict[int, tuple[float, float]]]] = []
     for recorded_ns, reading in ((recorded_ns, each) for recorded_ns, step in bundle.readings for each in step):
-        series_id = numbers[machine_id, reading.quantity, reading.name]
+        series_id = numbers[reading.quantity, reading.name]
         times = {"end_ns": reading.end_ns, "recorded_ns": recorded_ns}
         if not made or made[-1][0] != times or series_id in made[-1][1]:
             made.append((times, {}))
