@@ -21,12 +21,15 @@ import zstandard
 from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport, StoreError
 
 _LARGEST = 2**63
-_LEVEL = 15
+# Nearly as small as level 15 (2.09 kB instead of 2.00), in a fifth of its time.
+_HOW = zstandard.ZstdCompressionParameters(
+    window_log=17, chain_log=17, hash_log=16, search_log=4, min_match=6, strategy=zstandard.STRATEGY_BTLAZY2
+)
 # Never change it: every report that was ever written is read with it, also those from before it existed.
 _LIKE_REPORTS = zstandard.ZstdCompressionDict(
     Path(__file__).with_name("reports.dictionary").read_bytes(), dict_type=zstandard.DICT_TYPE_RAWCONTENT
 )
-_LIKE_REPORTS.precompute_compress(_LEVEL)  # once: for every report it would double the time
+_LIKE_REPORTS.precompute_compress(compression_params=_HOW)  # once: for every report it would double the time
 
 
 class PackedReport(NamedTuple):
@@ -149,7 +152,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
         _check(machine, f"alarm event {event.sequence}", event)
     if step.checkpoint is not None:
         _check(machine, "checkpoint", step.checkpoint.head)
-    compressor = zstandard.ZstdCompressor(_LEVEL, dict_data=_LIKE_REPORTS)
+    compressor = zstandard.ZstdCompressor(dict_data=_LIKE_REPORTS, compression_params=_HOW)
     return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 
 
