@@ -24,7 +24,7 @@ _APART = 0.935
 def dispersion_of(model: SpectralModel, weights: Weights, found: Maximum, segments: ComplexArray) -> float:
     """Variance of the spectra's elements over that of Gaussian segments with the same mean; at least 1.
 
-    It is 1 where the spectra deviate from the theory by no more than chance explains: then nobody needs to know.
+    Where the spectra deviate from the theory by no more than chance explains, it is taken to be 1 and not computed.
 
     Parameters
     ----------
