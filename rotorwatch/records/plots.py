@@ -72,7 +72,7 @@ class PlaceSpectrum(Record):
 
     location: _Location
     channels: tuple[str, ...] = Field(description="the two channels", examples=[("y1", "z1")])
-    unit: str = Field(description="unit of the diameters", examples=["µm p-p"])
+    unit: str = Field(description="unit of the diameters", examples=["µm pp"])
     values: _Series = Field(description="diameter of the circle of each line", examples=[(0.8, 0.3, 7.4)])
 
 
@@ -106,7 +106,7 @@ class WaterfallSnapshot(_ValuesOfSamples):
     """Spectra of one channel over time or speed."""
 
     channel: str = Field(default="", description="name of the channel; empty without one", examples=["y1"])
-    unit: str = Field(default="", description="unit of the amplitudes", examples=["µm p-p"])
+    unit: str = Field(default="", description="unit of the amplitudes", examples=["µm pp"])
     over: Literal["time", "speed"] = Field(description="whether rows are ordered by time or speed", examples=["time"])
     frequencies_hz: tuple[float, ...] = Field(default=(), description="n_bins values", examples=[(20.0, 22.0)])
     resolution_hz: float | None = Field(default=None, description="line spacing; null if there is none", examples=[2.0])
@@ -118,7 +118,7 @@ class ChannelVectors(Record):
     """Vectors of one channel at an order of running speed; n values."""
 
     channel: str = Field(description="name of the channel", examples=["y1"])
-    unit: str = Field(description="unit of the amplitudes", examples=["µm p-p"])
+    unit: str = Field(description="unit of the amplitudes", examples=["µm pp"])
     amplitude: _Series = Field(description="amplitude", examples=[(4.1, 9.8, 16.2)])
     phase_lag_deg: _Series = Field(description="phase lag, 0 to 360°", examples=[(12.0, 15.5, 21.3)])
 

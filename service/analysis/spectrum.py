@@ -57,7 +57,7 @@ def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
     if scaling == "density":
         return (f"({unit})²/Hz" if "/" in unit or "²" in unit else f"{unit}²/Hz"), factor**2
     if channel.quantity in _PEAK_TO_PEAK_QUANTITIES:
-        return f"{unit} p-p", 2 * factor
+        return f"{unit} pp", 2 * factor
     return f"{unit} rms", float(factor / np.sqrt(2))
 
 

@@ -31,7 +31,7 @@ _AtOption = Annotated[
 _WindowOption = Annotated[float, typer.Option("--window", metavar="S", help="Seconds of data used.")]
 _ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Line spacing.")]
 _DensityOption = Annotated[
-    bool, typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms).")
+    bool, typer.Option("--density", help="Power spectral density, not amplitudes (displacement pp, others rms).")
 ]
 _ToHzOption = Annotated[
     float | None,

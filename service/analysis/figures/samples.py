@@ -57,7 +57,7 @@ def waveform(look: Look, data: Recorded, names: Sequence[str], window_s: float |
         axes.set_title(f"{channel.name}   {place_text(channel)}", fontweight="bold")
         across, rms = factor * np.ptp(everything[:, number]), factor * np.std(everything[:, number])
         axes.set_title(
-            f"{across:.4g} {shown} p-p     {rms:.3g} {shown} rms     about a mean of {factor * mean:.4g} {shown}",
+            f"{across:.4g} {shown} pp     {rms:.3g} {shown} rms     about a mean of {factor * mean:.4g} {shown}",
             loc="right", color=GREY,
         )  # fmt: skip
         axes.set_ylabel(shown)

@@ -277,7 +277,7 @@ def full_spectrum(look: Look, data: Recorded, place: str | None, lines: Lines, *
         axes.plot(found.lines[shown], np.where(clear, values, np.nan)[shown], color=COLOURS[0], linewidth=0.9)
         axes.axvline(0, color=INK, linewidth=0.8)
         axes.set_title(f"{pair[0].location}   {' and '.join(one.name for one in pair)}", fontweight="bold")
-        axes.set_ylabel("µm p-p")
+        axes.set_ylabel("µm pp")
         _heights(axes, values[clear], _dynamic_range(found) if lines.log else None, 1.22)
         for at, side, text in zip((0.01, 0.99), ("left", "right"), sides, strict=True):
             axes.text(at, 0.97, text, transform=axes.transAxes, ha=side, va="top", color=INK, fontstyle="italic")
@@ -304,5 +304,5 @@ def _marks(axes: Axes, found: FullSpectrum, values: np.ndarray, shown: npt.NDArr
             _mark_order(axes, sign * order * turns, order, of_axis=turns / float(np.ptp(found.lines[shown])))
             heights.append(f"{values[near].max():.3g}")
         if len(heights) == 2:
-            texts.append(f"{order}× forward {heights[1]}, reverse {heights[0]} µm p-p")
+            texts.append(f"{order}× forward {heights[1]}, reverse {heights[0]} µm pp")
     axes.set_title("     ".join(texts), loc="right", color=COLOURS[1])

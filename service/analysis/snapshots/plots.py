@@ -34,7 +34,7 @@ _WITHOUT_SPEED_S = 0.5
 _FULL_S, _FULL_HZ = 10.0, 1.0
 _MOST_ROWS, _MOST_LINES = 60, 400
 _ROW_S = 0.5
-_UM = "µm p-p"
+_UM = "µm pp"
 _MOST_VECTORS = 1000
 _CENTRELINE_S = 1.0
 

@@ -62,7 +62,7 @@ def test_vectors_and_centrelines_of_the_history_are_those_of_the_reports(setting
     number = np.arange(COUNT)
     found = read_run_up(data, data.channels(["z1", "y2"]), 1, 8)
     assert found.speed_rad_s * 30 / np.pi == pytest.approx(-(1000 + 10 * number))
-    assert (found.direction, found.units) == (-1, ("µm p-p", "µm p-p"))
+    assert (found.direction, found.units) == (-1, ("µm pp", "µm pp"))
     assert found.amplitude == pytest.approx(np.stack([20.0 + number] * 2, axis=1))
     assert found.lag_deg == pytest.approx(np.stack([90 + 2.0 * number, 180 + 2.0 * number], axis=1))
     line = read_centreline(data, recorded_pairs(data), 1.0)

@@ -86,7 +86,7 @@ def test_a_forward_orbit_is_on_the_forward_side_of_the_full_spectrum(data: Sampl
 
 def test_a_waterfall_follows_the_run_up(data: Sampled) -> None:
     found = waterfall_snapshot(data, CHANNELS[0], "time")
-    assert (found.unit, found.channel) == ("µm p-p", "y1")
+    assert (found.unit, found.channel) == ("µm pp", "y1")
     assert len(found.rows) == 40
     frequencies = np.array(found.frequencies_hz)
     for row in found.rows:
@@ -108,7 +108,7 @@ def test_vectors_of_a_run_up_have_its_amplitude_and_lag(data: Sampled) -> None:
     at_s = (np.array(found.times_ns) - START_NS) / S
     assert speed == pytest.approx(FROM_HZ + (TO_HZ - FROM_HZ) / SECONDS * at_s, rel=5e-3)
     for one, lag in zip(found.channels, (40.0, 130.0), strict=True):
-        assert one.unit == "µm p-p"
+        assert one.unit == "µm pp"
         assert numbers(one.amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.02)
         assert numbers(one.phase_lag_deg) == pytest.approx(lag, abs=2)
     bare = vector_series(data, CHANNELS, 1, 5, 1000.0)

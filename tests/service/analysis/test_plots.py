@@ -89,7 +89,7 @@ def test_orbits_need_the_requested_revolutions_without_a_gap(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("off_line", "name", "stated", "factor"),
-    [(0.0, "y2", "µm p-p", 2.0), (0.5, "y2", "µm p-p", 2.0), (0.25, "y2_dot", "mm/s rms", 0.5**0.5)],
+    [(0.0, "y2", "µm pp", 2.0), (0.5, "y2", "µm pp", 2.0), (0.25, "y2_dot", "mm/s rms", 0.5**0.5)],
 )
 def test_a_sine_reads_its_amplitude_in_the_quantitys_unit_within_scalloping(
     tmp_path: Path, off_line: float, name: str, stated: str, factor: float
@@ -120,7 +120,7 @@ def test_displacement_is_shown_peak_to_peak_and_velocity_rms() -> None:
             text, factor = shown_as(channel, "amplitude")
             said.append(text)
             assert factor == pytest.approx(expected)
-    assert said == ["µm p-p", "µm p-p", "mil p-p", "mm/s rms", "in/s rms"]
+    assert said == ["µm pp", "µm pp", "mil pp", "mm/s rms", "in/s rms"]
 
 
 def test_axes_of_spectra_cover_the_harmonics_and_not_drift(tmp_path: Path) -> None:

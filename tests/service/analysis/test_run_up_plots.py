@@ -181,7 +181,7 @@ def test_a_run_up_shows_the_critical_speed_of_a_simple_rotor(run_up: tuple[int, 
     sense, data = run_up
     found = read_run_up(data, data.channels(["y2", "z2"]), 1, 4)
     hz = np.abs(found.speed_rad_s) / (2 * np.pi)
-    assert (found.direction, found.units) == (sense, ("µm p-p", "µm p-p"))
+    assert (found.direction, found.units) == (sense, ("µm pp", "µm pp"))
     top = found.amplitude.argmax(axis=0)
     assert hz[top] == pytest.approx(CRITICAL_HZ / np.sqrt(1 - 2 * DAMPING**2), rel=0.01)
     assert found.amplitude.max(axis=0) == pytest.approx(20 / (2 * DAMPING * np.sqrt(1 - DAMPING**2)), rel=0.03)
@@ -221,7 +221,7 @@ def test_a_polar_plot_counts_the_lag_against_the_rotation_from_the_sensor(run_up
 
 def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Recorded]) -> None:
     lower, upper = drawn(bode(Look(), run_up[1], ["y2"], 1, 4, None)).axes
-    assert lower.get_ylabel() == "1× amplitude, µm p-p"
+    assert lower.get_ylabel() == "1× amplitude, µm pp"
     top, bottom = upper.get_ylim()
     assert top > bottom  # lag grows downwards
     assert lower.get_title(loc="right").startswith("greatest: 2")
@@ -285,7 +285,7 @@ def test_without_a_keyphasor_the_speed_is_tracked_in_the_vibration_without_phase
     assert found.speed_rad_s / (2 * np.pi) == pytest.approx(15 + 0.25 * middle_s, rel=2e-3)
     assert found.amplitude == pytest.approx(40, rel=0.02)
     figure = drawn(bode(Look(), data, ["y2"], 1, 8, None, (600, 2400)))
-    assert [axes.get_ylabel() for axes in figure.axes] == ["1× amplitude, µm p-p"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["1× amplitude, µm pp"]
     with pytest.raises(MachineFileError, match="--slow-roll needs phases"):
         read_run_up(data, channels, 1, 8, 500.0, (600, 2400))
     quiet = machine_blocks({"y2": lambda t: noise[: t.size]}, 20.0)
@@ -344,7 +344,7 @@ def test_a_waveform_has_the_unit_of_its_channel_and_a_mark_at_each_pulse(
     first, second = drawn(waveform(Look(), data, ["y1", "y2_dot"], window_s)).axes
     assert (first.get_ylabel(), second.get_ylabel()) == ("µm", "mm/s")
     assert second.get_xlim() == pytest.approx((0, shown_ms), abs=0.5)
-    assert first.get_title(loc="right").startswith("14 µm p-p     4.95 µm rms     about a mean of 500 µm")
+    assert first.get_title(loc="right").startswith("14 µm pp     4.95 µm rms     about a mean of 500 µm")
     time_ms, values = (np.asarray(one, dtype=np.float64) for one in first.lines[1].get_data())
     assert np.diff(time_ms) == pytest.approx(50.0, abs=0.01)
     assert values == pytest.approx(7, rel=1e-3)

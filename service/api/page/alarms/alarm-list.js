@@ -19,6 +19,8 @@ function known(alarm) {
   return [size, alarm.note].filter(Boolean).join("; ");
 }
 
+const DONE = /** @type {Record<string, string>} */ ({ acknowledge: "acknowledged", reset: "reset", shelve: "shelved", unshelve: "unshelved", "remove-from-service": "taken out of service", "return-to-service": "returned to service" });
+
 /** @param {Placed} one */
 const keyOf = ({ place, alarm }) => `${place} ${alarm.name}`;
 
@@ -138,10 +140,10 @@ class AlarmList extends HTMLElement {
       const what = `${one.place}: ${one.alarm.text}`;
       try {
         await monitor.operate(one.place, one.alarm, kind, order);
-        said.push(`${what}: ${kind} done.`);
+        said.push(`${what}: ${DONE[kind]}.`);
         this.#chosen.delete(keyOf(one));
       } catch (error) {
-        said.push(`${what}: Not done. ${error instanceof Refused ? error.message : String(error)}`);
+        said.push(`${what}: not done. ${error instanceof Refused ? error.message : String(error)}`);
       }
     }
     this.#message.textContent = said.join(" ");

@@ -29,7 +29,7 @@ PLOTS = (
         "vector-plot", "vectors", "canvas, svg",
         r"^1× of y1, history, \d+ vectors of a window each.*1320 rpm.* over time$",
     ),
-    ("waterfall-plot", "waterfalls", "canvas", r"^Newest samples, 20 spectra of y1, .*strongest shade is \d+ µm p-p"),
+    ("waterfall-plot", "waterfalls", "canvas", r"^Newest samples, 20 spectra of y1, .*strongest shade is \d+ µm pp"),
     ("full-spectrum-plot", "full-spectra", "canvas", r"^Newest samples, .*, 19 averages"),
     ("centreline-plot", "centrelines", "svg", r"^History, \d+ mean positions"),
     ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; distance from theory"),
