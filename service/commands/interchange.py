@@ -1,13 +1,12 @@
 """``rotorwatch import`` and ``rotorwatch export``: recordings from and to files of other programs."""
 
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import prepare_numerics
+from service.commands.running import FromOption, prepare_numerics
 
 commands = typer.Typer()
 _LISTED = 5
@@ -68,11 +67,13 @@ def export(
     what: Annotated[
         Literal["stream", "reports", "alarms"], typer.Option(help="Samples, reports or alarm events.")
     ] = "stream",
-    machine: Annotated[
-        str | None, typer.Option(metavar="SITE/MACHINE", help="Machine to export, if there are several.")
+    key: Annotated[
+        str | None, typer.Option("--key", "--machine", metavar="SITE/MACHINE", help="Which machine, if several.")
     ] = None,
-    from_: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Data from this time (UTC).")] = None,
-    to_time: Annotated[str | None, typer.Option(metavar="TIME", help="Data up to this time (UTC).")] = None,
+    from_: FromOption = None,
+    to_time: Annotated[
+        str | None, typer.Option("--to-time", metavar="TIME", help="Data before this time; same format.")
+    ] = None,
     si: Annotated[bool, typer.Option("--si", help="Samples in SI units instead of those of the channels.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
@@ -84,30 +85,23 @@ def export(
 
     [cyan]rotorwatch export run7.mcap --to parquet --out run7.parquet[/cyan]
 
-    One minute as text, in m and m/s:
-    [cyan]rotorwatch export run7.mcap --to csv --out minute.csv --si --from 2026-01-31T12:00:00 --to-time
-    2026-01-31T12:01:00[/cyan]
+    The second minute as text, in m and m/s:
+    [cyan]rotorwatch export run7.mcap --to csv --out minute.csv --si --from 60 --to-time 120[/cyan]
     """
     prepare_numerics()
     from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
     from service.interchange.exporting import export as write  # noqa: PLC0415
+    from service.recordings.replay.source import RecordingSource, parse_moment  # noqa: PLC0415
 
-    from_ns, to_ns = _nanoseconds("--from", from_), _nanoseconds("--to-time", to_time)
-    table = write(Selection(tuple(recordings), machine, from_ns, to_ns, si), what, to, out, overwrite=overwrite)
+    source = RecordingSource(recordings)
+    keys = source.machine(key, reports=True)
+    from_ns, to_ns = (
+        None if text is None else parse_moment(text, source.span(keys).start_ns, option)
+        for text, option in ((from_, "--from"), (to_time, "--to-time"))
+    )
+    table = write(Selection(source, keys, from_ns, to_ns, si), what, to, out, overwrite=overwrite)
     typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
     for text in table.skipped[:_LISTED]:
         typer.echo(f"left out: {text}", err=True)
     if len(table.skipped) > _LISTED:
         typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
-
-
-def _nanoseconds(option: str, text: str | None) -> int | None:
-    """Parse an ISO 8601 time to nanoseconds since 1970; a time without a zone is UTC."""
-    if text is None:
-        return None
-    from models.signals.block import nanoseconds  # noqa: PLC0415  # keeps --help quick
-
-    try:
-        return nanoseconds(datetime.fromisoformat(text))
-    except ValueError as error:
-        raise MachineFileError(f"{option} is {text!r}, expected a time such as 2026-01-31T12:00:00Z (UTC)") from error

@@ -7,26 +7,26 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 from pydantic import BaseModel, ValidationError
 
-from models.errors import MachineFileError, RecordingError, WireError
+from models.errors import RecordingError, WireError
 from models.levels.limits import unit_of
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor
-from models.signals.keys import PREFIX
-from models.signals.recording import RecordedMessage, read_recording, summarize_recording
+from models.signals.keys import MachineKeys
+from models.signals.recording import RecordedMessage
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import MEASURES, Report
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.conversion import rfc3339
+from service.recordings.replay.source import RecordingSource
 
 _ROWS = 65536
 _MESSAGES = 1000
@@ -48,42 +48,12 @@ class _Levels(BaseModel):
 class Selection:
     """Data to be exported from recordings."""
 
-    recordings: tuple[Path, ...]  # in any order; they are read in order of their starts
-    machine: str | None = None  # ``site/machine``; optional if the recordings hold only one
+    source: RecordingSource
+    keys: MachineKeys
     # Data time, start included, end excluded.
     from_ns: int | None = None
     to_ns: int | None = None
     si: bool = False  # whether samples are converted to SI units
-
-    def messages(self, *keys: str) -> Iterator[tuple[Path, RecordedMessage]]:
-        """Messages under these keys, and the recording of each."""
-        for path in sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path)):
-            for message in read_recording(path, keys=set(keys)):
-                yield path, message
-
-    def root(self) -> str:
-        """Prefix of the machine's keys.
-
-        Raises
-        ------
-        MachineFileError
-            If the recordings hold several machines and none is chosen, or the chosen one is missing.
-        RecordingError
-            If the recordings hold no machine or cannot be read.
-        """
-        keys = {key for path in self.recordings for key in summarize_recording(path).messages}
-        parts = {tuple(key.split("/")[:3]) for key in keys if key.startswith(f"{PREFIX}/") and key.count("/") >= 3}
-        machines = sorted("/".join(part[1:]) for part in parts)
-        names = ", ".join(str(path) for path in self.recordings)
-        if self.machine is not None and self.machine not in machines:
-            raise MachineFileError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
-        if not machines:
-            raise RecordingError(f"{names}: contains no message of a machine")
-        if self.machine is None and len(machines) != 1:
-            raise MachineFileError(
-                f"{names}: expected one machine, there are {', '.join(machines)}; choose one with --machine"
-            )
-        return f"{PREFIX}/{self.machine or machines[0]}"
 
     def wants(self, time_ns: int) -> bool:
         """Whether a time is within the limits."""
@@ -113,8 +83,7 @@ def stream_table(selection: Selection) -> Table:
     RecordingError
         If there is no stream or no descriptor, or the channels change within the recordings.
     """
-    root = selection.root()
-    descriptor = _descriptor(selection, f"{root}/descriptor", f"{root}/stream")
+    descriptor = _descriptor(selection)
     fields = [_field("time_ns", pa.int64(), "ns", "acquisition time since 1970-01-01 UTC")]
     factors = [channel.to_si if selection.si else 1.0 for channel in descriptor.channels]
     kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
@@ -128,7 +97,7 @@ def stream_table(selection: Selection) -> Table:
         "descriptor": descriptor.model_dump_json(),
     }
     table = Table(pa.schema(fields, metadata=metadata), iter(()))
-    table.batches = _stream_batches(selection, f"{root}/stream", descriptor, factors, table)
+    table.batches = _stream_batches(selection, descriptor, factors, table)
     return table
 
 
@@ -156,13 +125,13 @@ def report_table(selection: Selection) -> Table:
         for value, meaning in _READINGS.items()
     ]
     fields += _level_fields(selection)
-    return _message_table(selection, "report", fields, _report_row, "end_ns")
+    return _message_table(selection, selection.keys.report, fields, _report_row, "end_ns")
 
 
 def _level_fields(selection: Selection) -> list[pa.Field]:
     """A column for each level of each channel that occurs in any report."""
     found: dict[str, pa.Field] = {}
-    for _, message in selection.messages(f"{selection.root()}/report"):
+    for message in selection.source.messages({selection.keys.report}):
         with suppress(ValidationError):  # reported when its row is read
             for levels in _Levels.model_validate_json(message.payload).levels:
                 pp = levels.detection == "peak to peak"
@@ -198,27 +167,28 @@ def alarm_table(selection: Selection) -> Table:
         _field("reason", pa.string(), "", "why"),
         _field("id", pa.string(), "", "the same however often the event is delivered"),
     ]
-    return _message_table(selection, "alarm/event", fields, _alarm_row, "time_ns")
+    return _message_table(selection, selection.keys.alarm_event, fields, _alarm_row, "time_ns")
 
 
 def _field(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Field:
     return pa.field(name, kind, metadata={"unit": unit, "description": description})
 
 
-def _descriptor(selection: Selection, key: str, stream: str) -> ChannelDescriptor:
+def _descriptor(selection: Selection) -> ChannelDescriptor:
     """The channel descriptor of the selected blocks; all of them must have the same."""
     found: dict[str, ChannelDescriptor] = {}
-    for path, message in selection.messages(key):
-        descriptor = _described(path, message)
+    source, key = selection.source, selection.keys.descriptor
+    for message in source.messages({key}):
+        descriptor = _described(message)
         found[descriptor.schema_hash] = descriptor
     if not found:
-        names = ", ".join(str(path) for path in selection.recordings)
+        names = ", ".join(map(str, source.paths))
         raise RecordingError(f"{names}: no channel descriptor on {key}, so the columns have no names and units")
     latest = next(iter(found.values()))
     used: ChannelDescriptor | None = None
-    for path, message in selection.messages(key, stream) if len(found) > 1 else ():
+    for message in source.messages({key, selection.keys.stream}) if len(found) > 1 else ():
         if message.key == key:
-            latest = _described(path, message)
+            latest = _described(message)
             continue
         with suppress(WireError):  # named when the samples are read
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
@@ -227,41 +197,41 @@ def _descriptor(selection: Selection, key: str, stream: str) -> ChannelDescripto
                 continue
             if used is not None and own != used:
                 raise RecordingError(
-                    f"{path}: the channels on {key} have changed at {rfc3339(block.start_ns)}; export what is before "
+                    f"the channels on {key} have changed at {rfc3339(block.start_ns)}; export what is before "
                     "and after that by itself, with --to-time and --from"
                 )
             used = own
     return used or latest
 
 
-def _described(path: Path, message: RecordedMessage) -> ChannelDescriptor:
+def _described(message: RecordedMessage) -> ChannelDescriptor:
     try:
         return ChannelDescriptor.model_validate_json(message.payload)
     except ValidationError as error:
         told = "; ".join(text for _, text in mistakes(error, ChannelDescriptor))
-        raise RecordingError(f"{path}: the channel descriptor on {message.key} cannot be read: {told}") from error
+        raise RecordingError(f"the channel descriptor on {message.key} cannot be read: {told}") from error
 
 
 def _stream_batches(
-    selection: Selection, key: str, descriptor: ChannelDescriptor, factors: Sequence[float], table: Table
+    selection: Selection, descriptor: ChannelDescriptor, factors: Sequence[float], table: Table
 ) -> Iterator[pa.RecordBatch]:
     """Collect blocks in batches; blocks that overlap or cannot be used are left out and listed in `skipped`."""
     pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.floating]]] = []
     count, last_ns = 0, -(2**63)
     tolerance_ns = round(5e8 / descriptor.rate_hz)
-    for path, message in selection.messages(key):
+    for message in selection.source.messages({selection.keys.stream}):
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
-            table.skipped.append(f"{path}: {error}")
+            table.skipped.append(f"a block recorded at {rfc3339(message.log_time_ns)}: {error}")
             continue
         if not selection.overlaps(block):
             continue
         if (schema_hash and schema_hash != descriptor.schema_hash) or block.samples.shape[1] != len(factors):
-            table.skipped.append(f"{path}: block {block.sequence} has other channels than the descriptor")
+            table.skipped.append(f"block {block.sequence} has other channels than the descriptor")
             continue
         if block.start_ns < last_ns - tolerance_ns:
-            table.skipped.append(f"{path}: block {block.sequence} starts before the end of the one before it")
+            table.skipped.append(f"block {block.sequence} starts before the end of the one before it")
             continue
         last_ns = block.end_ns
         time_ns = block.start_ns + np.rint(np.arange(block.samples.shape[0]) * (1e9 / block.rate_hz)).astype(np.int64)
@@ -293,18 +263,17 @@ def _batch(
 
 
 def _message_table(
-    selection: Selection, topic: str, fields: list[pa.Field], row: Callable[[bytes], _Row], time: str
+    selection: Selection, key: str, fields: list[pa.Field], row: Callable[[bytes], _Row], time: str
 ) -> Table:
     """Rows from JSON messages; messages that violate their schema are left out and listed in `skipped`."""
-    key = f"{selection.root()}/{topic}"
     table = Table(pa.schema(fields, metadata={"key": key}), iter(()))
 
     def rows() -> Iterator[_Row]:
-        for path, message in selection.messages(key):
+        for message in selection.source.messages({key}):
             try:
                 found = row(message.payload)
             except ValidationError as error:
-                table.skipped.append(f"{path}: a message on {key} cannot be read: {error}")
+                table.skipped.append(f"a message on {key} cannot be read: {error}")
                 continue
             when = found[time]
             if isinstance(when, int) and selection.wants(when):

@@ -42,7 +42,7 @@ def export(
     """
     if out.exists() and not overwrite:
         raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
-    if any(path.exists() and out.exists() and path.samefile(out) for path in selection.recordings):
+    if any(path.exists() and out.exists() and path.samefile(out) for path in selection.source.paths):
         raise RecordingError(f"{out}: is one of the recordings")
     table = _TABLES[what](selection)
     with _completed(out) as part:
@@ -56,7 +56,7 @@ def export(
             case "mat":
                 _write_matlab(table, part)
         if table.rows == 0:
-            names = ", ".join(str(path) for path in selection.recordings)
+            names = ", ".join(map(str, selection.source.paths))
             why = f" ({table.skipped[0]})" if table.skipped else ""
             timed = selection.from_ns is not None or selection.to_ns is not None
             why = f" in the time that is wanted{why}" if timed else why

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
+from service.interchange.exported import Selection
 from service.interchange.importing import Imported, import_file, summary_lines
 from service.interchange.mapping import load_mapping
+from service.recordings.replay.source import RecordingSource
 
 START = "2026-01-31T12:00:00Z"
 START_NS = 1769860800_000_000_000
@@ -37,6 +40,12 @@ PULSES = SAMPLED + CHANNELS.replace("theta =", "# theta =") + "[keyphasor]\n"
 class Stretch:
     start_ns: int
     samples: FloatArray
+
+
+def selected(*paths: Path, key: str | None = None, **more: Any) -> Selection:
+    """Everything of a machine in recordings, or the part that is asked for."""
+    source = RecordingSource(paths)
+    return Selection(source, source.machine(key, reports=True), **more)
 
 
 def machine(**changes: object) -> Machine:

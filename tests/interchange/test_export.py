@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -19,25 +20,27 @@ from models.signals.wire import encode_arrow, encode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
-from service.interchange.exported import Selection, stream_table
+from service.interchange.exported import stream_table
 from service.interchange.exporting import ExportFormat, export
-from tests.interchange.material import START_NS, imported, stretches
+from tests.interchange.material import START_NS, imported, selected, stretches
 
 LAB = load_machine("lab")
 STEP_NS = 500_000
 
 
 def recording(
-    path: Path, described: Machine = LAB, blocks: int = 400, gap_after: int = 150, lost: int = 37
+    path: Path, described: Machine = LAB, blocks: int = 400, gap_after: int = 150, lost: int = 37, after_ns: int = 0
 ) -> FloatArray:
     """A live recording with a gap, blocks in both encodings, reports and alarms; its samples."""
     rng = np.random.default_rng(5)
     samples = rng.standard_normal((blocks * 200, len(described.sensors))).astype(described.dtype)
     keys, schema_hash = described.keys, described.descriptor.schema_hash
+    clock = count(START_NS + after_ns)
     with RecordingWriter(path) as writer:
 
         def put(key: str, payload: bytes, attachment: bytes, encoding: str) -> None:
-            writer.write(RecordedMessage(key, payload, attachment, encoding, START_NS, START_NS))
+            now_ns = next(clock)
+            writer.write(RecordedMessage(key, payload, attachment, encoding, now_ns, now_ns))
 
         put(keys.descriptor, described.descriptor.model_dump_json().encode(), b"", "application/json")
         for number in range(blocks):
@@ -77,7 +80,7 @@ SI = {"um": "m", "mm/s": "m/s", "rad": "rad"}
 def test_exports_open_in_other_libraries_and_import_unchanged(tmp_path: Path, kind: ExportFormat, si: bool) -> None:
     samples = recording(tmp_path / "run.mcap")
     out = tmp_path / f"run.{kind}"
-    table = export(Selection((tmp_path / "run.mcap",), si=si), "stream", kind, out)
+    table = export(selected(tmp_path / "run.mcap", si=si), "stream", kind, out)
     assert table.rows == samples.shape[0]
     assert len(table.skipped) == 2  # the repeated block and the invalid one
     units = {channel.name: SI[channel.unit] if si else channel.unit for channel in LAB.sensors}
@@ -122,9 +125,7 @@ def test_exports_open_in_other_libraries_and_import_unchanged(tmp_path: Path, ki
 
 def test_a_selected_part_is_cut_to_the_sample(tmp_path: Path) -> None:
     whole = recording(tmp_path / "b.mcap")
-    selection = Selection(
-        (tmp_path / "b.mcap",), from_ns=START_NS + 1001 * STEP_NS - 7, to_ns=START_NS + 1700 * STEP_NS
-    )
+    selection = selected(tmp_path / "b.mcap", from_ns=START_NS + 1001 * STEP_NS - 7, to_ns=START_NS + 1700 * STEP_NS)
     export(selection, "stream", "parquet", tmp_path / "part.parquet")
     read = pa.parquet.read_table(tmp_path / "part.parquet")
     np.testing.assert_array_equal(read.column("time_ns").to_numpy(), times()[1001:1700])
@@ -133,7 +134,7 @@ def test_a_selected_part_is_cut_to_the_sample(tmp_path: Path) -> None:
 
 def test_reports_and_alarms_are_exported_as_tables(tmp_path: Path) -> None:
     recording(tmp_path / "run.mcap", blocks=2)
-    selection = Selection((tmp_path / "run.mcap",), to_ns=START_NS + 6_000_000_000)
+    selection = selected(tmp_path / "run.mcap", to_ns=START_NS + 6_000_000_000)
     table = export(selection, "reports", "parquet", tmp_path / "reports.parquet")
     assert len(table.skipped) == 1  # the truncated message
     read = pa.parquet.read_table(tmp_path / "reports.parquet")
@@ -150,13 +151,16 @@ def test_reports_and_alarms_are_exported_as_tables(tmp_path: Path) -> None:
     for column, unit in units.items():
         assert read.column(f"{levels.channel}.{column}").to_pylist() == [getattr(levels, column)] * 2
         assert read.schema.field(f"{levels.channel}.{column}").metadata[b"unit"] == unit.encode()
-    export(Selection((tmp_path / "run.mcap",)), "alarms", "csv", tmp_path / "alarms.csv")
+    export(selected(tmp_path / "run.mcap"), "alarms", "csv", tmp_path / "alarms.csv")
     with (tmp_path / "alarms.csv").open(newline="", encoding="utf-8") as file:
         (event,) = list(csv.DictReader(file))
     said = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
     assert (event["name"], event["kind"], int(event["time_ns"])) == (said.data.name, said.data.kind, said.data.time_ns)
     assert event["text"] == said.data.text
-    export(Selection((tmp_path / "run.mcap",)), "reports", "mat", tmp_path / "reports.mat")
+    (tmp_path / "capture.mcap").write_bytes((tmp_path / "run.mcap").read_bytes())  # around an alarm: the same messages
+    twice = selected(tmp_path / "run.mcap", tmp_path / "capture.mcap")
+    assert export(twice, "alarms", "csv", tmp_path / "alarms.csv", overwrite=True).rows == 1
+    export(selected(tmp_path / "run.mcap"), "reports", "mat", tmp_path / "reports.mat")
     content = loadmat(tmp_path / "reports.mat", simplify_cells=True)["data"]
     assert content["state"]["samples"].tolist() == [report.state] * 3
     assert np.isnan(content["e_relative_change"]["samples"]).all()
@@ -167,13 +171,13 @@ def test_channels_that_change_are_exported_by_themselves(tmp_path: Path) -> None
     sensors = [channel.model_dump() for channel in LAB.sensors]
     sensors[0]["unit"] = "mil"
     changed = Machine.model_validate({**LAB.model_dump(), "sensors": sensors})
-    recording(tmp_path / "b.mcap", changed, blocks=2, gap_after=0, lost=2)
+    recording(tmp_path / "b.mcap", changed, blocks=2, gap_after=0, lost=2, after_ns=10**8)
     both, change_ns = (tmp_path / "a.mcap", tmp_path / "b.mcap"), START_NS + 400 * STEP_NS
     said = "the channels on rotorwatch/demo/lab/descriptor have changed at 2026-01-31T12:00:00.200000Z; export"
     with pytest.raises(RecordingError, match=said):
-        export(Selection(both), "stream", "csv", tmp_path / "out.csv")
+        export(selected(*both), "stream", "csv", tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
-    for part, unit in ((Selection(both, to_ns=change_ns), "um"), (Selection(both, from_ns=change_ns), "mil")):
+    for part, unit in ((selected(*both, to_ns=change_ns), "um"), (selected(*both, from_ns=change_ns), "mil")):
         table = stream_table(part)
         assert table.schema.field(1).metadata[b"unit"] == unit.encode()
         assert (sum(batch.num_rows for batch in table.batches), table.skipped) == (400, [])
@@ -183,8 +187,11 @@ def test_a_recording_without_reports_says_what_makes_them(tmp_path: Path) -> Non
     described = LAB.descriptor.model_dump_json().encode()
     with RecordingWriter(tmp_path / "bare.mcap") as writer:
         writer.write(RecordedMessage(LAB.keys.descriptor, described, b"", "application/json", START_NS, START_NS))
+        writer.write(
+            RecordedMessage(LAB.keys.stream, b"abc", b"", "application/x-rotorwatch-block", START_NS, START_NS)
+        )
     with pytest.raises(RecordingError, match=r"bare.mcap: no reports: only a monitor records them; rotorwatch replay"):
-        export(Selection((tmp_path / "bare.mcap",)), "reports", "csv", tmp_path / "out.csv")
+        export(selected(tmp_path / "bare.mcap"), "reports", "csv", tmp_path / "out.csv")
 
 
 def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
@@ -192,32 +199,32 @@ def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
     recording(tmp_path / "a.mcap", blocks=2)
     recording(tmp_path / "b.mcap", heavy, blocks=3)
     both = (tmp_path / "a.mcap", tmp_path / "b.mcap")
-    with pytest.raises(MachineFileError, match="there are demo/heavy, demo/lab; choose one with --machine"):
-        export(Selection(both), "stream", "csv", tmp_path / "out.csv")
-    with pytest.raises(MachineFileError, match="no machine demo/light; there are demo/heavy, demo/lab"):
-        export(Selection(both, machine="demo/light"), "stream", "csv", tmp_path / "out.csv")
-    assert export(Selection(both, machine="demo/heavy"), "stream", "csv", tmp_path / "out.csv").rows == 600
+    with pytest.raises(MachineFileError, match="demo/heavy, demo/lab; name one, as --key SITE/MACHINE"):
+        export(selected(*both), "stream", "csv", tmp_path / "out.csv")
+    with pytest.raises(MachineFileError, match=r"of demo/light; machines with .*: demo/heavy, demo/lab"):
+        export(selected(*both, key="demo/light"), "stream", "csv", tmp_path / "out.csv")
+    assert export(selected(*both, key="demo/heavy"), "stream", "csv", tmp_path / "out.csv").rows == 600
 
 
 def test_missing_data_and_unusable_output_files_are_named(tmp_path: Path) -> None:
     recording(tmp_path / "run.mcap", blocks=2)
-    selection = Selection((tmp_path / "run.mcap",), from_ns=START_NS + 10**12)
+    selection = selected(tmp_path / "run.mcap", from_ns=START_NS + 10**12)
     with pytest.raises(RecordingError, match="no stream in the time that is wanted"):
         export(selection, "stream", "parquet", tmp_path / "out.parquet")
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
     with pytest.raises(MachineFileError, match=r"run\.mcap: already exists; --overwrite replaces it"):
-        export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap")
+        export(selected(tmp_path / "run.mcap"), "stream", "parquet", tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=r"run\.mcap: is one of the recordings"):
-        export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap", overwrite=True)
+        export(selected(tmp_path / "run.mcap"), "stream", "parquet", tmp_path / "run.mcap", overwrite=True)
     with pytest.raises(RecordingError, match=r"none/a\.csv: cannot be written \(No such file or directory\)"):
-        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", tmp_path / "none" / "a.csv")
+        export(selected(tmp_path / "run.mcap"), "stream", "csv", tmp_path / "none" / "a.csv")
     with RecordingWriter(tmp_path / "nothing.mcap"):
         pass
-    with pytest.raises(RecordingError, match=r"nothing\.mcap: contains no message of a machine"):
-        export(Selection((tmp_path / "nothing.mcap",)), "stream", "csv", tmp_path / "a.csv")
+    with pytest.raises(RecordingError, match=r"nothing\.mcap: contains no messages"):
+        export(selected(tmp_path / "nothing.mcap"), "stream", "csv", tmp_path / "a.csv")
     with pytest.raises(RecordingError, match="is a folder, expected the name of a file"):
-        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", Path(), overwrite=True)
+        export(selected(tmp_path / "run.mcap"), "stream", "csv", Path(), overwrite=True)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(RecordingError, match="pipe: is a device or pipe, expected the name of a file"):
-        export(Selection((tmp_path / "run.mcap",)), "stream", "csv", tmp_path / "pipe", overwrite=True)
+        export(selected(tmp_path / "run.mcap"), "stream", "csv", tmp_path / "pipe", overwrite=True)
     assert (tmp_path / "pipe").is_fifo()

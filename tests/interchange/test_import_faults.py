@@ -367,6 +367,8 @@ def test_the_documented_example_is_imported_and_exported(tmp_path: Path) -> None
     assert found.returncode == 0, found.stderr
     assert f"{out}: 4000 rows, 10 columns" in found.stdout
     assert pyarrow.parquet.read_metadata(out).num_rows == 4000
+    second = ("--from", "0.5", "--to-time", "1.5", "--key", "example/fe-rotor", "--overwrite")
+    assert f"{out}: 2000 rows" in run("export", recording, "--to", "parquet", "--out", out, *second).stdout
 
 
 def test_importing_a_folder_with_a_bad_file_exits_1(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.health import Report
-from service.interchange.exported import Selection
 from service.interchange.exporting import export
 from service.interchange.importing import summary_lines
 from service.recordings.replay.offline import OfflineReplay
@@ -35,6 +34,7 @@ from tests.interchange.material import (
     good_rows,
     imported,
     machine,
+    selected,
     signals,
     table,
     with_cell,
@@ -104,7 +104,7 @@ def test_an_empty_cell_takes_its_channel_out_of_one_block(tmp_path: Path, cell: 
     expected[600:800, 1] = np.nan
     np.testing.assert_array_equal(samples_of(recording, machine()), expected)
     # An export of the recording imports identically.
-    export(Selection((recording,)), "stream", "csv", tmp_path / "again.csv")
+    export(selected(recording), "stream", "csv", tmp_path / "again.csv")
     again = TEXT.replace("[time]", MISSING).replace(f'start = "{START}"', 'unit = "ns"\nstart = "unix"')
     for name, column in {"t": "time_ns", "x": "y1 [um]", "v": "y1_dot [mm/s]", "a": "theta [rad]"}.items():
         again = again.replace(f'column = "{name}"', f'column = "{column}"')

@@ -24,11 +24,12 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from rotorwatch.records.windows import SensorFault
 from service.analysis.recorded import Recorded
 from service.analysis.trend import read_trend
-from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
+from service.interchange.exported import Table, alarm_table, report_table, stream_table
 from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
+from tests.interchange.material import selected
 from tests.service.rig.live import LAB, Feed, fed_service, machine_file, until
 from tests.sure import sure
 
@@ -200,7 +201,7 @@ def test_reports_alarm_logs_and_recordings_of_every_version_are_read(version: st
         if one.key == KEYS.stream
     ]
     assert [(block.sequence, block.samples.shape) for block in blocks] == [(0, (200, 9)), (1, (200, 9))]
-    selection = Selection((path,))
+    selection = selected(path)
     assert (len(everything(stream_table(selection))), len(everything(report_table(selection)))) == (400, 1)
     assert len(everything(alarm_table(selection))) == 6
 
@@ -232,7 +233,7 @@ def test_unknown_sensor_faults_and_descriptor_fields_are_accepted() -> None:
 
 
 def test_recordings_of_a_later_version_are_exported_and_plotted(of_later: Path) -> None:
-    now, later_on = Selection((FIXTURES / VERSIONS[-1] / "recording.mcap",)), Selection((of_later,))
+    now, later_on = selected(FIXTURES / VERSIONS[-1] / "recording.mcap"), selected(of_later)
     for table in (stream_table, report_table, alarm_table):
         assert everything(table(later_on)) == everything(table(now))
     source = RecordingSource([of_later])
