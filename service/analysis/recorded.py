@@ -19,7 +19,7 @@ from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from models.signals.wire import decode_block
 from service.analysis.revolutions import Excerpt
-from service.recordings.replay.source import RecordingSource, parse_moment
+from service.recordings.replay.source import RecordingSource, clock, parse_moment
 
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
@@ -178,7 +178,10 @@ class Recorded(Sampled):
         keys = source.machine(key, reports=reports)
         from_ns, to_ns = source.between(*between, keys)
         if at is not None:
-            at_ns = parse_moment(at, source.span(keys).start_ns, "--at")
+            span = source.span(keys)
+            at_ns = parse_moment(at, span.start_ns, "--at")
+            if at_ns > span.end_ns:
+                raise MachineFileError(f"--at {at}: the data end at {clock(span.end_ns)} UTC")
             if not from_ns < at_ns:
                 raise MachineFileError(f"--at {at}: nothing was recorded before that, from {between[0] or 0} on")
             to_ns = min(to_ns, at_ns)

@@ -197,10 +197,15 @@ def doctor(
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.signals.recording import RecordedMessage  # noqa: PLC0415
     from service.analysis.arrival import examined  # noqa: PLC0415
-    from service.stream.transport import Link, tap  # noqa: PLC0415
+    from service.stream.transport import Link, LinkError, tap  # noqa: PLC0415
 
     known = load_machine_file(machine)
-    session = Link(link_of(connect, listen or (None if connect or link else [ENDPOINT]), link))
+    listening = listen or ([] if connect or link else [ENDPOINT])
+    try:
+        session = Link(link_of(connect, listening, link))
+    except LinkError as error:
+        beside = f" If it is a monitor, listen beside it: --connect {listening[0]}" if listening else ""
+        raise LinkError(f"{error}{beside}") from error
     heard: list[RecordedMessage] = []
     try:
         close = tap(session, known.keys, heard.append)

@@ -1,6 +1,7 @@
 """From nothing to the first trend: `rotorwatch init`, `doctor`, `run` and `plot trend` with a user's two sensors."""
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -133,6 +134,11 @@ def test_the_doctor_reports_a_wrong_rate_and_missing_data(tmp_path: Path) -> Non
     silent = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", endpoint(), "--seconds", "1")
     assert silent.returncode == 1
     assert "nothing arrived under rotorwatch/plant/fan/stream" in silent.stdout
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        refused = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", taken)
+    assert refused.returncode == 1
+    assert f"If it is a monitor, listen beside it: --connect {taken}" in refused.stderr
     assert "no publisher answers a query for it (docs/wire.md)" in silent.stdout
 
 

@@ -107,6 +107,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
         (("correlation", "--machine", "lab"), "name a bundle that has networks, as --machine FILE@BUNDLE"),
         (("correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
         (("orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
+        (("orbit", "--at", "500"), "--at 500: the data end at 2026-01-01 00:01:"),
         (("orbit", "--from", "500"), "nothing was recorded in between"),
         (("orbit", "--from", "65.9", "--revolutions", "9"), "--revolutions is 9, but only"),
         (("orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
