@@ -211,7 +211,7 @@ class Grammar:
 
     def _might_be_used(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
         try:
-            block, _ = decode_block(payload, attachment, encoding)
+            block = decode_block(payload, attachment, encoding)
         except WireError:
             return False
         return self._gate.form(block) is None

@@ -33,14 +33,6 @@ from models.ingest import EARLIER_COURSES, Course
 from models.signals.block import SampleBlock
 
 
-@dataclass(frozen=True, slots=True)
-class Arrived:
-    """A block and the schema hash that its sender named, empty if none."""
-
-    block: SampleBlock
-    schema_hash: str = ""
-
-
 class Arrivals:
     """Puts the blocks of one machine in the order of their sequence, run by run.
 
@@ -58,7 +50,7 @@ class Arrivals:
     >>> import numpy as np
     >>> arrivals = Arrivals(20)
     >>> blocks = [SampleBlock(n, n, 1, 1e9, np.zeros((1, 1))) for n in range(4)]
-    >>> [[one.block.sequence for one in arrivals.take(blocks[n])] for n in (0, 2, 3, 1)]
+    >>> [[one.sequence for one in arrivals.take(blocks[n])] for n in (0, 2, 3, 1)]
     [[0], [], [], [1, 2, 3]]
     """
 
@@ -68,7 +60,7 @@ class Arrivals:
         self._bound = bound
         self._run: int | None = None
         self._next = 0
-        self._waiting: dict[int, list[Arrived]] = {}
+        self._waiting: dict[int, list[SampleBlock]] = {}
         self._courses: deque[Course] = deque(maxlen=EARLIER_COURSES + 1)  # of what has gone on, the present one last
 
     @property
@@ -76,36 +68,35 @@ class Arrivals:
         """How many blocks wait, repetitions not counted."""
         return len(self._waiting)
 
-    def take(self, block: SampleBlock, schema_hash: str = "") -> tuple[Arrived, ...]:
+    def take(self, block: SampleBlock) -> tuple[SampleBlock, ...]:
         """Take a block as it arrives, and return those that may go to the gate now, in order.
 
         Repetitions of blocks that have gone on do so at once and change nothing here; those of waiting blocks follow
         their originals.
         """
-        arrived = Arrived(block, schema_hash)
         if self._bound == 0 or any(course.covers(block) for course in self._courses):
-            return (arrived,)
+            return (block,)
         if block.run == self._run and block.sequence >= self._next:
             if block.sequence > self._next or self._waiting:
-                return self._place(arrived)
+                return self._place(block)
             self._note(block)
             self._next += 1
-            return (arrived,)
+            return (block,)
         # Another run, or a count that began anew: the missing blocks of the old one are given up.
         gone_on, known = self.flush(), 0
         if block.run != self._run:
             known = max((course.sequence for course in self._courses if course.run == block.run), default=0)
         self._run = block.run
         self._next = known if known <= block.sequence <= known + self._bound else block.sequence
-        return gone_on + self._place(arrived)
+        return gone_on + self._place(block)
 
     def withdraw(self, run: int, sequence: int) -> bool:
         """Take back a block, and say whether it waited; its place stays open."""
         return run == self._run and self._waiting.pop(sequence, None) is not None
 
-    def flush(self) -> tuple[Arrived, ...]:
+    def flush(self) -> tuple[SampleBlock, ...]:
         """Hand on everything that waits: the stream is silent, or the recording has ended."""
-        found: list[Arrived] = []
+        found: list[SampleBlock] = []
         while self._waiting:
             self._next = min(self._waiting)
             found += self._continued()
@@ -117,11 +108,11 @@ class Arrivals:
         self._courses = deque((*courses,)[-EARLIER_COURSES:], self._courses.maxlen)
         self._run, self._next = (self._courses[-1].run, self._courses[-1].sequence) if self._courses else (None, 0)
 
-    def _place(self, arrived: Arrived) -> tuple[Arrived, ...]:
+    def _place(self, block: SampleBlock) -> tuple[SampleBlock, ...]:
         """Put a block of the present run in its place, and hand on what is complete."""
-        copies = self._waiting.setdefault(arrived.block.sequence, [])
-        if not copies or not _same(copies[0], arrived):
-            copies.append(arrived)
+        copies = self._waiting.setdefault(block.sequence, [])
+        if not copies or _digest(copies[0]) != _digest(block):
+            copies.append(block)
         elif len(copies) <= self._bound:
             copies.append(copies[0])  # takes no memory, and the gate can count it
         found = self._continued()
@@ -131,12 +122,12 @@ class Arrivals:
             found += self._continued()
         return tuple(found)
 
-    def _continued(self) -> list[Arrived]:
+    def _continued(self) -> list[SampleBlock]:
         """Hand on blocks from the next one up to a hole."""
-        found: list[Arrived] = []
+        found: list[SampleBlock] = []
         while (copies := self._waiting.pop(self._next, None)) is not None:
             found += copies
-            self._note(copies[0].block)
+            self._note(copies[0])
             self._next += 1
         return found
 
@@ -147,11 +138,6 @@ class Arrivals:
             self._courses[-1] = now.extended(block)
         else:
             self._courses.append(Course.beginning(block))
-
-
-def _same(one: Arrived, other: Arrived) -> bool:
-    """Whether two blocks of one run and sequence are the same to the last bit."""
-    return one.schema_hash == other.schema_hash and _digest(one.block) == _digest(other.block)
 
 
 _REMEMBERED = 256

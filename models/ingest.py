@@ -176,18 +176,13 @@ class Gate:
         if size_alone or encoding.startswith(ARROW_ENCODING):
             return True
         try:
-            block, schema_hash = decode_block(payload, attachment, encoding)
+            return self.form(decode_block(payload, attachment, encoding)) is None
         except WireError:
             return False
-        return self.form(block, schema_hash) is None
 
-    def judge(self, block: SampleBlock, schema_hash: str | None = "") -> Admission:
-        """Accept or refuse a block.
-
-        The schema hash is the one that the sender named, empty if it named none; None if the block's `form` has been
-        found right before.
-        """
-        return (None if schema_hash is None else self.form(block, schema_hash)) or self._place(block)
+    def judge(self, block: SampleBlock, *, formed: bool = False) -> Admission:
+        """Accept or refuse a block; `formed` if its `form` has been found right before."""
+        return (None if formed else self.form(block)) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that is remembered, as named arrays."""
@@ -214,13 +209,13 @@ class Gate:
     def _refuse(self, reason: Reason, text: str) -> Admission:
         return Admission(reason, f"{self._name}: {text}")
 
-    def form(self, block: SampleBlock, schema_hash: str = "") -> Admission | None:  # noqa: PLR0911  # one return per reason
+    def form(self, block: SampleBlock) -> Admission | None:  # noqa: PLR0911  # one return per reason
         """Refuse a block whose form is wrong, whatever its time."""
         settings, channels, which = self._settings, self._channels, f"block {block.sequence}"
         n_samples, n_channels = block.samples.shape
-        if schema_hash and schema_hash != self._schema_hash:
-            text = f"the stream's channel descriptor has hash {schema_hash}, expected {self._schema_hash} for channels "
-            return self._refuse(Reason.CHANNELS, text + ", ".join(channels))
+        if block.schema_hash and block.schema_hash != self._schema_hash:
+            text = f"the stream's channel descriptor has hash {block.schema_hash}, expected {self._schema_hash}"
+            return self._refuse(Reason.CHANNELS, f"{text} for channels {', '.join(channels)}")
         if n_channels != len(channels):
             text = f"{which} has {n_channels} channels, expected {len(channels)} ({', '.join(channels)})"
             return self._refuse(Reason.CHANNELS, text)

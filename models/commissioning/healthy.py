@@ -50,23 +50,20 @@ class HealthyRecording:
 
 
 def healthy_from_blocks(
-    name: str, machine: MachineFile, blocks: Iterable[tuple[SampleBlock, str]], until_s: float | None = None
+    name: str, machine: MachineFile, blocks: Iterable[SampleBlock], until_s: float | None = None
 ) -> HealthyRecording:
-    """Cut a stream into hops, up to `until_s` after its first sample.
-
-    Each block comes with the hash of the channel descriptor that its sender named, or "".
-    """
+    """Cut a stream into hops, up to `until_s` after its first sample."""
     plan = plan_for(machine, levels=True)
     gate, window = Gate(machine), SlidingWindow(replace(plan, hops=1))
     stretches: list[list[HopMoments]] = [[]]
     refused: Counter[str] = Counter()
     gaps, missing_s, last_refusal = 0, 0.0, ""
     first_ns: int | None = None
-    for block, schema_hash in blocks:
+    for block in blocks:
         first_ns = block.start_ns if first_ns is None else first_ns
         if until_s is not None and block.end_ns - first_ns > round(until_s * 1e9):
             break
-        verdict = gate.judge(block, schema_hash)
+        verdict = gate.judge(block)
         if not verdict.accepted:
             refused[str(verdict.reason)] += 1
             last_refusal = verdict.text
@@ -125,7 +122,7 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     return found
 
 
-def _blocks(path: Path, machine: MachineFile) -> Iterator[tuple[SampleBlock, str]]:
+def _blocks(path: Path, machine: MachineFile) -> Iterator[SampleBlock]:
     for message in read_recording(path, keys={machine.keys.stream}):
         try:
             yield decode_block(message.payload, message.attachment, message.encoding)

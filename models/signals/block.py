@@ -39,6 +39,7 @@ class SampleBlock:
     rate_hz: float  # samples per second and channel
     # (n_samples, n_channels): float32 or float64, in the units of the channel descriptor
     samples: SampleArray
+    schema_hash: str = ""  # of the channel descriptor that its sender named; empty if none
 
     @property
     def end_ns(self) -> int:

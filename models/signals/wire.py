@@ -184,8 +184,8 @@ def encode_arrow(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, st
     return write_arrow(block.samples, metadata), b"", f"{ARROW_ENCODING};{schema_hash}"
 
 
-def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[SampleBlock, str]:
-    """Decode a block in either encoding, with the schema hash that this names, empty if none.
+def decode_block(payload: bytes, attachment: bytes, encoding: str) -> SampleBlock:
+    """Decode a block in either encoding.
 
     In the raw encoding the samples are a read-only view of the payload.
 
@@ -197,11 +197,11 @@ def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[Samp
     kind, _, schema_hash = encoding.partition(";")
     schema_hash = schema_hash[:_LONGEST_TEXT]
     if kind == BLOCK_ENCODING:
-        return _decode_raw(payload, attachment), schema_hash
+        return _decode_raw(payload, attachment, schema_hash)
     if kind == ARROW_ENCODING:
         samples, metadata = _read_arrow(payload)
         numbers = {field: _metadata_number(metadata, field) for field in _ARROW_FIELDS}
-        return _checked(**numbers, samples=samples), schema_hash
+        return _checked(**numbers, samples=samples, schema_hash=schema_hash)
     raise WireError(f"encoding {encoding[:_LONGEST_TEXT]!r} is not {BLOCK_ENCODING!r} or {ARROW_ENCODING!r}")
 
 
@@ -224,7 +224,7 @@ def may_be_block(payload: bytes, attachment: bytes, encoding: str, n_channels: i
     return bool(channels == n_channels and len(payload) == n_samples * n_channels * size <= most)
 
 
-def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
+def _decode_raw(payload: bytes, attachment: bytes, schema_hash: str) -> SampleBlock:
     if len(attachment) != HEADER_BYTES:
         raise WireError(f"header (attachment) has {len(attachment)} bytes, expected {HEADER_BYTES}")
     start_ns, sequence, rate_hz, code, n_channels, run, n_samples = _HEADER.unpack(attachment)
@@ -236,7 +236,7 @@ def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
         shape = f"{n_samples} samples × {n_channels} channels"
         raise WireError(f"payload has {len(payload)} bytes, expected {expected} for {shape}")
     samples: npt.NDArray[Any] = np.frombuffer(payload, dtype=_DTYPES[code]).reshape(n_samples, n_channels)
-    return _checked(start_ns, sequence, run, rate_hz, samples)
+    return _checked(start_ns, sequence, run, rate_hz, samples, schema_hash)
 
 
 def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:
@@ -247,7 +247,9 @@ def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:
         raise WireError(f"Arrow schema metadata field {field!r} is {text!r}, expected a number") from error
 
 
-def _checked(start_ns: int, sequence: int, run: int, rate_hz: float, samples: npt.NDArray[Any]) -> SampleBlock:
+def _checked(
+    start_ns: int, sequence: int, run: int, rate_hz: float, samples: npt.NDArray[Any], schema_hash: str
+) -> SampleBlock:
     """Make a block of fields, in either encoding, that are within what the header can hold."""
     _check_shape(*samples.shape)
     for field, value, least, most in (
@@ -258,7 +260,7 @@ def _checked(start_ns: int, sequence: int, run: int, rate_hz: float, samples: np
     ):
         if not least <= value <= most:
             raise WireError(f"header field {field} is {value}, expected {least} to {most}")
-    return SampleBlock(start_ns, sequence, run, rate_hz, samples)
+    return SampleBlock(start_ns, sequence, run, rate_hz, samples, schema_hash)
 
 
 def _check_shape(n_samples: int, n_channels: int) -> None:

@@ -57,12 +57,12 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     breaks: list[Admission] = []
     for message in stream:
         try:
-            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+            block = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
             refused["malformed"].append(f"it cannot be decoded: {error}")
             continue
         rates.add(block.rate_hz)
-        verdict = gate.judge(block, schema_hash)
+        verdict = gate.judge(block)
         if not verdict.accepted:
             refused[str(verdict.reason)].append(verdict.text)
             continue

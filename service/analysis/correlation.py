@@ -1,7 +1,7 @@
 """Correlation functions of one window, compared with the predictions of the trained networks for each equation."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,8 +60,8 @@ def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
     window, gate = SlidingWindow(plan_for(machine)), Gate(machine)
     latest: WindowStatistics | None = None
     refusal, data_s = "", 0.0
-    for block, schema_hash in _blocks(data, machine):
-        verdict = gate.judge(block, schema_hash)
+    for block in _blocks(data, machine):
+        verdict = gate.judge(block)
         if not verdict.accepted:
             refusal = verdict.text
             continue
@@ -116,10 +116,10 @@ def _panel(
     return Panel(target, over, x, curves, reading)
 
 
-def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock, str]]:
-    """Decoded blocks, each with the schema hash that the gate shall check; undecodable blocks are left out.
+def _blocks(data: Recorded, machine: MachineFile) -> Iterator[SampleBlock]:
+    """Blocks that can be decoded.
 
-    The hash covers site and name. If only these differ from the machine file, it is given as empty, i.e. not checked.
+    The schema hash covers site and name. If only these differ from the machine file, it is empty, i.e. not checked.
     """
     descriptor = data.source.descriptor(data.keys, data.from_ns)
     differences = () if descriptor is None else descriptor_mismatch(descriptor.payload, machine)
@@ -127,10 +127,10 @@ def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock,
     other_name = (machine.site, machine.name) != (data.keys.site, data.keys.machine)
     for message in data.messages(data.keys.stream):
         try:
-            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+            block = decode_block(message.payload, message.attachment, message.encoding)
         except WireError:
             continue
-        yield block, "" if other_name and only_named else schema_hash
+        yield replace(block, schema_hash="") if other_name and only_named else block
 
 
 @dataclass(frozen=True, slots=True)

@@ -256,11 +256,11 @@ class Recorded(Sampled):
         since = self.from_ns if from_ns is None else from_ns
         for message in self.source.messages({self.keys.stream}, from_ns=since, to_ns=self.to_ns):
             try:
-                block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+                block = decode_block(message.payload, message.attachment, message.encoding)
             except WireError:
                 continue
             if (
-                (schema_hash and schema_hash != descriptor.schema_hash)
+                block.schema_hash not in {"", descriptor.schema_hash}
                 or block.samples.shape[1] != len(descriptor.channels)
                 or abs(block.rate_hz / descriptor.rate_hz - 1) > _RATE_TOLERANCE
                 or not np.isfinite(block.samples[:, used]).all()

@@ -191,8 +191,8 @@ def _descriptor(selection: Selection) -> ChannelDescriptor:
             latest = _described(message)
             continue
         with suppress(WireError):  # named when the samples are read
-            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
-            own = found.get(schema_hash, latest)
+            block = decode_block(message.payload, message.attachment, message.encoding)
+            own = found.get(block.schema_hash, latest)
             if not selection.overlaps(block):
                 continue
             if used is not None and own != used:
@@ -221,13 +221,13 @@ def _stream_batches(
     tolerance_ns = round(5e8 / descriptor.rate_hz)
     for message in selection.source.messages({selection.keys.stream}):
         try:
-            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+            block = decode_block(message.payload, message.attachment, message.encoding)
         except WireError as error:
             table.skipped.append(f"a block recorded at {rfc3339(message.log_time_ns)}: {error}")
             continue
         if not selection.overlaps(block):
             continue
-        if (schema_hash and schema_hash != descriptor.schema_hash) or block.samples.shape[1] != len(factors):
+        if block.schema_hash not in {"", descriptor.schema_hash} or block.samples.shape[1] != len(factors):
             table.skipped.append(f"block {block.sequence} has other channels than the descriptor")
             continue
         if block.start_ns < last_ns - tolerance_ns:

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.arrivals import Arrivals, Arrived, Senders
+from models.arrivals import Arrivals, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.commissioned import Installed
 from models.diagnosis.sensors.missing import MissingNumbers, completed
@@ -64,7 +64,7 @@ class MachineMonitor:
         self.identity, self.watching = reporter.identity, reporter.watching
         self._window, self._levels, self._test = reporter.samples, reporter.levels, reporter.test
         self._senders, self._arrivals = Senders(), Arrivals(machine.ingest.reorder_blocks)
-        self._due: deque[Arrived] = deque()
+        self._due: deque[SampleBlock] = deque()
         self._done: list[MonitorReport] = []
         self._gate, self._missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
         self._parts = (
@@ -97,10 +97,10 @@ class MachineMonitor:
         self._dropped += dropped_before
         self.used = False
         try:
-            block, schema_hash = decode_block(payload, attachment, encoding)
+            block = decode_block(payload, attachment, encoding)
         except WireError as error:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
-        if (misshapen := self._gate.form(block, schema_hash)) is not None:  # before its run and number are used
+        if (misshapen := self._gate.form(block)) is not None:  # before its run and number are used
             return (MonitorReport(self._count(misshapen)),)
         if self._window.lacks or self._gate.had(block):  # `had`: sent again after a restart, neither new nor a mistake
             if self._gate.knows(block):
@@ -114,7 +114,7 @@ class MachineMonitor:
             return (MonitorReport(self._count(verdict), events=self.alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
-        self._due.extend(self._arrivals.take(block, schema_hash))
+        self._due.extend(self._arrivals.take(block))
         done, self.used = self._step_due(), self._used is block
         return done
 
@@ -124,10 +124,10 @@ class MachineMonitor:
         Returns whether it is the newest block that the monitor has had: blocks recorded after it are new.
         """
         try:
-            block, schema_hash = decode_block(payload, attachment, encoding)
+            block = decode_block(payload, attachment, encoding)
         except WireError:
             return False
-        return self._gate.form(block, schema_hash) is None and self._gate.knows(block) and self._recall(block)
+        return self._gate.form(block) is None and self._gate.knows(block) and self._recall(block)
 
     def _recall(self, block: SampleBlock) -> bool:
         newest = self._gate.is_newest(block)
@@ -169,18 +169,17 @@ class MachineMonitor:
     def _step_due(self) -> tuple[MonitorReport, ...]:
         """Step the blocks that are due; if one raises an error, the others are left for the next call."""
         while self._due:
-            self._done.append(self.step(self._due.popleft().block, None))
+            self._done.append(self.step(self._due.popleft(), formed=True))
         done, self._done = tuple(self._done), []
         return done
 
-    def step(self, block: SampleBlock, schema_hash: str | None = "") -> MonitorReport:
-        """Take one block: gate, window, evaluation, alarms.
+    def step(self, block: SampleBlock, *, formed: bool = False) -> MonitorReport:
+        """Take one block: gate (`formed`: see `Gate.judge`), window, evaluation, alarms.
 
-        `schema_hash` is that of the channel descriptor which the sender named, see `Gate.judge`. Refused blocks, gaps
-        and defects of the monitor are stated in the report, never raised.
+        Refused blocks, gaps and defects of the monitor are stated in the report, never raised.
         """
         dropped = self._drops.pop((block.run, block.sequence), 0)
-        verdict = self._admission_of(block, schema_hash, dropped)
+        verdict = self._admission_of(block, dropped, formed=formed)
         if not verdict.accepted:
             self._dropped += dropped
             return MonitorReport(verdict)
@@ -319,10 +318,10 @@ class MachineMonitor:
             self._refused,
         )
 
-    def _admission_of(self, block: SampleBlock, schema_hash: str | None, dropped: int) -> Admission:
+    def _admission_of(self, block: SampleBlock, dropped: int, *, formed: bool) -> Admission:
         """Judge a block by the gate and, if it is the first one after a restart, by the time of the data before."""
         anew = not self._gate.courses
-        verdict = self._gate.judge(block, schema_hash)
+        verdict = self._gate.judge(block, formed=formed)
         if anew and verdict.accepted and self.end_ns is not None:
             name, ingest = self.machine.title, self.machine.ingest
             late_s = (block.start_ns - self.end_ns) / 1e9

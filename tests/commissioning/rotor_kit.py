@@ -126,7 +126,7 @@ def with_lines(stream_: Sequence[SampleBlock], parts: Mapping[float, float], ord
 
 
 def recording(machine: MachineFile, stream_: Sequence[SampleBlock], name: str = "healthy.mcap") -> HealthyRecording:
-    return healthy_from_blocks(name, machine, ((block, "") for block in stream_))
+    return healthy_from_blocks(name, machine, stream_)
 
 
 def windows_of(recorded: HealthyRecording) -> tuple[WindowStatistics, ...]:

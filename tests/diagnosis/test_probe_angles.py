@@ -252,5 +252,5 @@ def test_a_line_in_healthy_data_is_attributed_to_the_sensor_as_mounted() -> None
         samples[:, NAMES.index("z1")] += 60 * np.sin(2 * np.pi * 50 * t)
         return replace(block, samples=samples)
 
-    recording = healthy_from_blocks("r", API_670, [(with_hum(block), "") for block in simulated(API_670)])
+    recording = healthy_from_blocks("r", API_670, map(with_hum, simulated(API_670)))
     assert foreign_lines(recording)[0].state == "bearing@135"

@@ -86,9 +86,9 @@ def stretches(recording: Path, described: MachineFile | None = None) -> list[Str
     gate = Gate(described)
     found: list[tuple[int, list[FloatArray]]] = []
     for message in read_recording(recording, keys={described.keys.stream}):
-        block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        block = decode_block(message.payload, message.attachment, message.encoding)
         assert message.log_time_ns == block.end_ns
-        verdict = gate.judge(block, schema_hash)
+        verdict = gate.judge(block)
         assert verdict.accepted, verdict.text
         if not found or verdict.new_snapshot or not verdict.continuous:
             found.append((block.start_ns, []))

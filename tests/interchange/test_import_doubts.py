@@ -266,7 +266,7 @@ def test_files_imported_one_by_one_are_not_taken_for_a_clock_that_was_set(
         source = archive(tmp_path, t=time[rows] - time[rows][0], x=x[rows], v=v[rows], a=a[rows])
         out = imported(tmp_path, source, TEXT.replace(START, f"{np.datetime64(start_ns, 'ns')}Z"))[1]
         for message in read_recording(out, keys={machine().keys.stream}):
-            verdicts.append(gate.judge(*decode_block(message.payload, message.attachment, message.encoding)))
+            verdicts.append(gate.judge(decode_block(message.payload, message.attachment, message.encoding)))
     assert all(one.accepted for one in verdicts) == (step_s == 0)
     assert sum(one.gap_s for one in verdicts) == 0
     stepped = [one for one in verdicts if one.clock_step_s]

@@ -47,7 +47,7 @@ MISSING = '[time]\nnot_finite = "missing"'
 
 def blocks_of(recording: Path, described: MachineFile) -> list[SampleBlock]:
     messages = read_recording(recording, keys={described.keys.stream})
-    return [decode_block(one.payload, one.attachment, one.encoding)[0] for one in messages]
+    return [decode_block(one.payload, one.attachment, one.encoding) for one in messages]
 
 
 def samples_of(recording: Path, described: MachineFile) -> FloatArray:

@@ -77,9 +77,9 @@ def test_any_block_survives_the_round_trip(
     encode: Encoder, samples: npt.NDArray[Any], start_ns: int, sequence: int, run: int, rate_hz: float, schema_hash: str
 ) -> None:
     sent = SampleBlock(start_ns, sequence, run, rate_hz, samples)
-    received, received_hash = decode_block(*encode(sent, schema_hash))
+    received = decode_block(*encode(sent, schema_hash))
     assert (received.start_ns, received.sequence, received.run, received.rate_hz) == (start_ns, sequence, run, rate_hz)
-    assert received_hash == schema_hash
+    assert received.schema_hash == schema_hash
     assert received.samples.dtype == samples.dtype
     assert received.samples.tobytes() == samples.tobytes()  # bit by bit: NaN payloads and signed zeros too
     assert received.samples.shape == samples.shape
@@ -95,7 +95,7 @@ def test_any_block_survives_the_round_trip(
     ids=["fortran", "strided"],
 )
 def test_layout_in_memory_does_not_matter(encode: Encoder, view: npt.NDArray[Any]) -> None:
-    received, _ = decode_block(*encode(_block(view), ""))
+    received = decode_block(*encode(_block(view), ""))
     np.testing.assert_array_equal(received.samples, view)
 
 
@@ -171,7 +171,7 @@ def test_arrow_columns_must_be_lists_of_floats(column: Any, name: str, said: str
 )
 def test_arbitrary_bytes_make_a_block_or_a_wire_error(payload: bytes, header: bytes, encoding: str) -> None:
     try:
-        block, _ = decode_block(payload, header, encoding)
+        block = decode_block(payload, header, encoding)
     except WireError:
         return
     assert block.samples.ndim == 2
@@ -182,7 +182,7 @@ def test_a_truncated_arrow_stream_is_refused() -> None:
     refused = 0
     for cut in range(len(payload)):
         try:
-            block, _ = decode_block(payload[:cut], b"", encoding)
+            block = decode_block(payload[:cut], b"", encoding)
         except WireError:
             refused += 1
         else:  # only the end-of-stream mark may be missing
@@ -228,10 +228,10 @@ def test_the_page_names_encodings_and_units() -> None:
 def test_the_page_arrow_example_is_a_block() -> None:
     names: dict[str, Any] = {}
     exec(page_blocks("python")[-1], names)  # noqa: S102  # our own page
-    block, schema_hash = decode_block(names["payload"], b"", ARROW_ENCODING)
+    block = decode_block(names["payload"], b"", ARROW_ENCODING)
     np.testing.assert_array_equal(block.samples, np.array([[1, 2, 3], [4, 5, 6]], dtype=np.float32))
     assert (block.start_ns, block.sequence, block.run, block.rate_hz) == (1_767_225_600_000_000_000, 0, 1, 2000.0)
-    assert schema_hash == ""
+    assert block.schema_hash == ""
 
 
 def test_the_page_python_example_is_received(tmp_path: Path) -> None:
@@ -257,13 +257,13 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     descriptor = ChannelDescriptor.model_validate_json(descriptors[0])
     assert descriptor == ChannelDescriptor.model_validate_json(page_blocks("json")[0])
     stream = [decode_block(p, a, e) for key, p, a, e in received if key.endswith("/stream")]
-    assert [block.sequence for block, _ in stream] == [0, 1, 2, 3]
-    assert {schema_hash for _, schema_hash in stream} == {descriptor.schema_hash}
-    assert len({block.run for block, _ in stream}) == 1
-    for (earlier, _), (later, _) in pairwise(stream):
+    assert [block.sequence for block in stream] == [0, 1, 2, 3]
+    assert {block.schema_hash for block in stream} == {descriptor.schema_hash}
+    assert len({block.run for block in stream}) == 1
+    for earlier, later in pairwise(stream):
         assert later.start_ns == earlier.end_ns
-    assert stream[0][0].start_ns >= begin
-    samples = np.concatenate([block.samples for block, _ in stream])
+    assert stream[0].start_ns >= begin
+    samples = np.concatenate([block.samples for block in stream])
     angle = 2 * np.pi * 22.0 * np.arange(800) / 2000.0
     # float32 resolves 10 um to 1e-6 um
     np.testing.assert_allclose(samples[:, 0], 10 * np.cos(angle), atol=2e-6)
@@ -308,7 +308,7 @@ def test_a_damaged_arrow_stream_is_refused_or_a_block(data: st.DataObject) -> No
     for _ in range(data.draw(st.integers(1, 6))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     try:
-        block, _ = decode_block(bytes(payload), b"", ARROW_ENCODING)
+        block = decode_block(bytes(payload), b"", ARROW_ENCODING)
     except WireError:
         return
     assert block.samples.ndim == 2

@@ -56,7 +56,7 @@ class _Received:
 
     @property
     def sequences(self) -> list[int]:
-        return [decode_block(*sample)[0].sequence for sample in self.samples]
+        return [decode_block(*sample).sequence for sample in self.samples]
 
 
 @contextmanager
@@ -103,8 +103,8 @@ def test_a_late_subscriber_receives_everything(endpoint: str, monitor: zenoh.Ses
     assert (summary.blocks, summary.data_s) == (60, 6.0)
     assert stream.sequences == list(range(60))
     for sample, (block, _) in zip(stream.samples, blocks(SENT, MACHINE, run=7), strict=True):
-        received, schema_hash = decode_block(*sample)
-        assert schema_hash == MACHINE.descriptor.schema_hash
+        received = decode_block(*sample)
+        assert received.schema_hash == MACHINE.descriptor.schema_hash
         assert (received.run, received.start_ns) == (7, block.start_ns)
         np.testing.assert_array_equal(received.samples, block.samples)
     records = [TruthRecord.model_validate_json(payload) for payload, _, _ in truth.samples]
@@ -169,7 +169,7 @@ def test_arrow_streams_carry_the_same_samples(endpoint: str, monitor: zenoh.Sess
         until(lambda: len(stream.samples) >= 60, "60 blocks")
     received = [decode_block(*sample) for sample in stream.samples]
     assert {sample[2] for sample in stream.samples} == {f"{ARROW_ENCODING};{MACHINE.descriptor.schema_hash}"}
-    for (one, _), (other, _) in zip(received, blocks(SENT, MACHINE), strict=True):
+    for one, (other, _) in zip(received, blocks(SENT, MACHINE), strict=True):
         np.testing.assert_array_equal(one.samples, other.samples)
 
 

@@ -50,9 +50,9 @@ def test_a_recording_holds_what_the_publisher_would_send(tmp_path: Path) -> None
     assert times[0] == DEFAULT_START_NS
     stream = [m for m in messages if m.key == keys.stream]
     for message, (block, _) in zip(stream, blocks(scenario, machine, 0.25), strict=True):
-        received, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        received = decode_block(message.payload, message.attachment, message.encoding)
         assert (received.start_ns, received.sequence, received.run) == (block.start_ns, block.sequence, 1)
-        assert schema_hash == machine.descriptor.schema_hash
+        assert received.schema_hash == machine.descriptor.schema_hash
         assert message.log_time_ns == message.publish_time_ns == block.end_ns
         if block.end_ns <= DEFAULT_START_NS + 3_000_000_000:  # the same as without the fault, as it has not come yet
             np.testing.assert_array_equal(received.samples, block.samples)
@@ -76,7 +76,7 @@ def test_start_run_machine_and_arrow_are_options(tmp_path: Path) -> None:
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     stream = [m for m in read_recording(path) if m.key == "rotorwatch/demo/heavy/stream"]
-    block, _ = decode_block(stream[0].payload, stream[0].attachment, stream[0].encoding)
+    block = decode_block(stream[0].payload, stream[0].attachment, stream[0].encoding)
     assert (block.start_ns, block.run) == (1_804_133_167_500_000_000, 9)
 
 
@@ -97,7 +97,7 @@ def test_a_signal_ends_publishing_cleanly(tmp_path: Path, number: signal.Signals
     gone = threading.Event()
 
     def keep(sample: zenoh.Sample) -> None:
-        block, _ = decode_block(sample.payload.to_bytes(), sure(sample.attachment).to_bytes(), str(sample.encoding))
+        block = decode_block(sample.payload.to_bytes(), sure(sample.attachment).to_bytes(), str(sample.encoding))
         if block.sequence >= 3:
             three.set()
 

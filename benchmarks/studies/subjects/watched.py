@@ -41,7 +41,7 @@ def commissioned(file: MachineFile, *streams: Iterable[SampleBlock]) -> Installe
     recordings, entries = [], []
     for number, stream in enumerate(streams, start=1):
         healthy, name = list(stream), f"healthy {number}"
-        recordings.append(healthy_from_blocks(name, file, [(block, "") for block in healthy]))
+        recordings.append(healthy_from_blocks(name, file, healthy))
         entries.append(
             HealthyEntry(
                 name=name, sha256=f"{number:064d}", start_ns=healthy[0].start_ns, end_ns=healthy[-1].end_ns,

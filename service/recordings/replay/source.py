@@ -112,7 +112,7 @@ def _taken(message: RecordedMessage) -> _Taken | None:
             return None
         return _Taken(end_ns - 1, end_ns) if 0 < end_ns < _LATEST_NS else None
     try:
-        block, _ = decode_block(message.payload, message.attachment, message.encoding)
+        block = decode_block(message.payload, message.attachment, message.encoding)
     except WireError:
         return None
     return _Taken(block.start_ns, block.end_ns, block.sequence, block.run)

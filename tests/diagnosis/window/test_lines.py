@@ -45,7 +45,7 @@ def recording(
     samples[:, -1] = np.mod(turns * 2 * np.pi * speed_hz * T, 2 * np.pi)
     size = round(RATE_HZ)
     found = [
-        (SampleBlock(1_767_225_600_000_000_000 + n * 10**9, n, 1, RATE_HZ, part.astype(np.float32)), "")
+        SampleBlock(1_767_225_600_000_000_000 + n * 10**9, n, 1, RATE_HZ, part.astype(np.float32))
         for n, part in enumerate(np.split(samples, N // size))
     ]
     made = healthy_from_blocks("r", machine, found)

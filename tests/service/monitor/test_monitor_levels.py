@@ -163,7 +163,7 @@ def test_first_windows_are_kept_unless_sensors_or_their_settings_change(changes:
 
 
 def test_commissioned_levels_are_the_reference_and_the_state_is_unchanged(tmp_path: Path) -> None:
-    found = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
+    found = healthy_from_blocks("healthy.mcap", FAN, blocks(6, 150))
     made = commissioned(FAN, found)
     assert made.commissioned is not None, made.report.summary
     assert made.report.verdict == "limited"
@@ -185,7 +185,7 @@ def test_levels_are_judged_at_a_speed_not_commissioned() -> None:
     for size, state in ((1.0, HealthState.WATCHING), (4.0, HealthState.ALERT)):
         monitor = MachineMonitor(Installed(machine, None, made))
         for block in stream(66.0, 60164, faster, Event(at_s=0.0, excitation_level=size)):
-            monitor.step(block, machine.descriptor.schema_hash)
+            monitor.step(replace(block, schema_hash=machine.descriptor.schema_hash))
         now = monitor.health()
         assert now.state is state
         assert "levels are judged as at the nearest commissioned speed: speed is 1399 rpm" in now.reason

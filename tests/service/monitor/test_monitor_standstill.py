@@ -174,7 +174,7 @@ def test_levels_at_standstill_are_no_reference_for_running(machine: MachineFile)
 
 
 def test_a_stop_with_run_down_and_run_up_is_left_out_of_a_healthy_recording() -> None:
-    stream = [(block, "") for block in stopping(LAB, "machine")]
+    stream = list(stopping(LAB, "machine"))
     recorded = healthy_from_blocks("healthy.mcap", LAB, stream)
     hop_s = LAB.window.hop_s
     usual = LAB.operation.speed_rad_s * hop_s
@@ -184,5 +184,5 @@ def test_a_stop_with_run_down_and_run_up_is_left_out_of_a_healthy_recording() ->
         STARTS_S - STOPS_S < recorded.stopped_s < RUNS_S - STOPS_S + 4 * hop_s
     )  # an edge hop on either side, and the grid of hops
     assert recorded.duration_s + recorded.stopped_s == pytest.approx(END_S, abs=hop_s)
-    standing = [one for one in stream if STANDS_S < (one[0].start_ns - stream[0][0].start_ns) / 1e9 < STARTS_S - 1]
+    standing = [one for one in stream if STANDS_S < (one.start_ns - stream[0].start_ns) / 1e9 < STARTS_S - 1]
     assert healthy_from_blocks("standing.mcap", LAB, standing).stopped_s == 0

@@ -205,7 +205,7 @@ def test_a_monitor_stopped_between_or_in_snapshots_continues_bit_for_bit(at: int
 
 
 def test_a_healthy_recording_of_snapshots_uses_all_of_them() -> None:
-    found = healthy_from_blocks("kit", KIT, ((one, "") for one in stream()[:480]))
+    found = healthy_from_blocks("kit", KIT, stream()[:480])
     assert (len(found.hops), len(windows_of(found)), found.gaps) == (12, 2, 0)
     assert found.duration_s == 12 * ON_S
 

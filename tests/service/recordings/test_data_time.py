@@ -59,7 +59,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory, blocks: list[SampleBlock]) -
 
 def starts_s(source: RecordingSource, **limits: int) -> list[float]:
     found = source.messages({LAB.keys.stream}, **limits)
-    return [(decode_block(one.payload, one.attachment, one.encoding)[0].start_ns - START_NS) / S for one in found]
+    return [(decode_block(one.payload, one.attachment, one.encoding).start_ns - START_NS) / S for one in found]
 
 
 def stream_of(path: Path) -> Recorded:

@@ -196,7 +196,7 @@ def test_reports_alarm_logs_and_recordings_of_every_version_are_read(version: st
     assert [one.kind for one in events] == kinds
     path = FIXTURES / version / "recording.mcap"
     blocks = [
-        decode_block(one.payload, one.attachment, one.encoding)[0]
+        decode_block(one.payload, one.attachment, one.encoding)
         for one in read_recording(path)
         if one.key == KEYS.stream
     ]
