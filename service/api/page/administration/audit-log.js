@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const [PAGE, REFRESH_S] = [50, 15];
 
-/** @typedef {import("../monitor/records.d.ts").AuditRecord} AuditRecord */
+/** @import { AuditRecord } from "../monitor/records.d.ts" */
 
 /** Outcome of a request, in words. @param {AuditRecord} one */
 function outcome(one) {

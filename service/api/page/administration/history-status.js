@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const REFRESH_S = 60;
 
-/** @typedef {import("../monitor/records.d.ts").HistoryStatus} HistoryStatus */
+/** @import { HistoryStatus } from "../monitor/records.d.ts" */
 
 /** Size, time span and retention of the history. */
 class HistoryStatusTable extends LiveElement {

@@ -6,7 +6,7 @@ import "../elements/state-mark.js";
 
 const REFRESH_S = 10;
 
-/** @typedef {import("../monitor/records.d.ts").Readiness} Readiness */
+/** @import { Readiness } from "../monitor/records.d.ts" */
 
 /** Readiness of the service, and the load of each machine's monitor. */
 class ServiceLoad extends LiveElement {

@@ -2,7 +2,7 @@ import { html, lay, table } from "../elements/markup.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-/** @typedef {import("../monitor/records.d.ts").SettingList} SettingList */
+/** @import { SettingList } from "../monitor/records.d.ts" */
 
 /** The settings of the monitor as they are in use. */
 class SettingTable extends LiveElement {

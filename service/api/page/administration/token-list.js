@@ -7,7 +7,7 @@ const [REFRESH_S, DAYS] = [30, 90];
 const TOKENS = `${API}/tokens`;
 const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate", "acknowledge, shelve and reset alarms, start replays"], ["configure", "take alarms out of service, administer"]]);
 
-/** @typedef {import("../monitor/records.d.ts").TokenEntry} TokenEntry */
+/** @import { TokenEntry } from "../monitor/records.d.ts" */
 
 /** Tokens of the service, with a form to create one, and a button to revoke each. */
 class TokenTable extends LiveElement {

@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const REFRESH_S = 15;
 
-/** @typedef {import("../monitor/records.d.ts").WebhookStatus} WebhookStatus */
+/** @import { WebhookStatus } from "../monitor/records.d.ts" */
 
 /** Webhooks, with the last event that each accepted, and its last error. */
 class WebhookTable extends LiveElement {

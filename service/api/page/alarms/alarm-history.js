@@ -8,7 +8,7 @@ import "../elements/state-mark.js";
 
 const PAGE = 50;
 
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @import { AlarmEventData as AlarmEvent } from "../monitor/records.d.ts" */
 
 /** Alarm events of a machine, newest first. */
 class AlarmHistory extends MachineElement {

@@ -6,7 +6,7 @@ import { ordered } from "./alarm-order.js";
 import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.d.ts").Alarm} Alarm */
+/** @import { Alarm } from "../monitor/records.d.ts" */
 /** @typedef {{place: string, alarm: Alarm}} Placed */
 
 /** Reason why an alarm is silenced, else the size of its change, else its note. @param {Alarm} alarm */

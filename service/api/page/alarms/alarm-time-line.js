@@ -4,7 +4,7 @@ import { html, svg } from "../elements/markup.js";
 const [WIDTH, HEIGHT, LEAST] = [1000, 12, 3];
 const [BEGINS, ENDS] = [new Set(["raised", "escalated"]), new Set(["cleared", "reset"])];
 
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @import { AlarmEventData as AlarmEvent } from "../monitor/records.d.ts" */
 /** @typedef {{from: number, to: number, severity: string, text: string}} Spell */
 
 /** Times during which an alarm was raised, from its events, oldest first. @param {AlarmEvent[]} events @param {number} end @returns {Spell[]} */

@@ -6,9 +6,8 @@ import { choiceOf, offered } from "../plots/sample-plot.js";
 import { spectrumDrawing } from "../plots/spectrum-plot.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.d.ts").Picture} Picture */
-/** @typedef {import("../monitor/records.d.ts").CorrelationPair} Pair */
-/** @typedef {import("../elements/line-chart.js").Line} Line */
+/** @import { CorrelationPair as Pair, Picture } from "../monitor/records.d.ts" */
+/** @import { Line } from "../elements/line-chart.js" */
 
 const HEIGHT = 270;
 const AFTER = { label: "after", colour: "estimated", width: 2 };

@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
+/** @import { Parameter } from "../monitor/records.d.ts" */
 
 const [REACH, POINTS] = [4.5, 60]; // range on either side in standard errors, number of points
 

@@ -8,10 +8,7 @@ import "./before-after.js";
 import "../elements/line-chart.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.d.ts").AlarmEvidence} AlarmEvidence */
-/** @typedef {import("../monitor/records.d.ts").Report} Report */
-/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
-/** @typedef {import("../monitor/records.d.ts").ChannelLevels} ChannelLevels */
+/** @import { AlarmEvidence, ChannelLevels, Parameter, Report } from "../monitor/records.d.ts" */
 
 /** Measures that are shown even without a limit. */
 const MEASURES = ["overall", "velocity", "x1", "x2", "crest", "kurtosis"];

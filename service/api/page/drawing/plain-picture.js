@@ -6,8 +6,8 @@ import { levelUnit, measureText, STATES } from "../monitor/states.js";
 import { sensorState } from "../machine/machine-file.js";
 import { MARKS } from "./rotor-parts.js";
 
-/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
-/** @typedef {import("../monitor/records.d.ts").Health} Health */
+/** @import { Sensor } from "../machine/machine-file.js" */
+/** @import { Health } from "../monitor/records.d.ts" */
 
 const [WIDTH, LINE, SHAFT] = [360, 19, 22];
 

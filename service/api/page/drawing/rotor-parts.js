@@ -5,9 +5,9 @@ import { svg } from "../elements/markup.js";
 import { STATES } from "../monitor/states.js";
 import { angleOf, sensorState } from "../machine/machine-file.js";
 
-/** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
-/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
-/** @typedef {import("../monitor/records.d.ts").Health} Health */
+/** @import { Reading } from "../machine/parameter-readings.js" */
+/** @import { Sensor } from "../machine/machine-file.js" */
+/** @import { Health } from "../monitor/records.d.ts" */
 
 export const LINE = 14;
 export const MARKS = /** @type {Record<string, string>} */ ({ danger: "◆", alert: "▲", "data-health": "⬢" });

@@ -4,9 +4,9 @@ import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { arrow, damper, LINE, parameter, rotation, sensorsRound, spring } from "./rotor-parts.js";
 
-/** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
-/** @typedef {import("../machine/machine-file.js").MachineFile} MachineFile */
-/** @typedef {import("../monitor/records.d.ts").Health} Health */
+/** @import { Reading } from "../machine/parameter-readings.js" */
+/** @import { MachineFile } from "../machine/machine-file.js" */
+/** @import { Health } from "../monitor/records.d.ts" */
 
 const [WIDTH, HEIGHT] = [360, 496];
 const BEARING = { x: 196, y: 214 };

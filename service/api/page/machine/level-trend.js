@@ -2,8 +2,8 @@ import { figure, shownIn } from "../monitor/figures.js";
 import { levelUnit, limitText, measureText } from "../monitor/states.js";
 import { ReadingTrend } from "./reading-trend.js";
 
-/** @typedef {import("../monitor/records.d.ts").LevelBound} LevelBound */
-/** @typedef {import("../elements/line-chart.js").Zone} Zone */
+/** @import { LevelBound } from "../monitor/records.d.ts" */
+/** @import { Zone } from "../elements/line-chart.js" */
 
 /** Zones of a standard, in ascending order. @param {[number, number, number]} edges @returns {Zone[]} */
 const zonesOf = ([first, second, third]) => [

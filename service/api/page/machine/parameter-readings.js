@@ -1,4 +1,4 @@
-/** @typedef {import("../monitor/records.d.ts").Parameter} Parameter */
+/** @import { Parameter } from "../monitor/records.d.ts" */
 /** @typedef {{stated: Parameter, parameter: Parameter, read: boolean, why: string, seen: import("../monitor/records.d.ts").Detectable | undefined, severity: string}} Reading */
 
 /**

@@ -4,8 +4,8 @@ import { MachineElement } from "../elements/machine-element.js";
 import { parameterReadings } from "./parameter-readings.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.d.ts").Opinion} Opinion */
-/** @typedef {import("./parameter-readings.js").Reading} Reading */
+/** @import { Opinion } from "../monitor/records.d.ts" */
+/** @import { Reading } from "./parameter-readings.js" */
 
 /** Reading of a parameter by another diagnostician, and whether it agrees. @param {Opinion} opinion @param {string} name */
 function other(opinion, name) {

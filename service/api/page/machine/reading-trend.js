@@ -6,8 +6,7 @@ import "../elements/line-chart.js";
 
 const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 
-/** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @import { AlarmEventData as AlarmEvent, ReadingBucket as Bucket } from "../monitor/records.d.ts" */
 /** @typedef {{at: number, kind: "alert" | "danger", text: string, below?: boolean}} Limit */
 /** A reading shown over time; limits within `near` are always visible. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 

@@ -2,8 +2,7 @@
 
 import { EventStream, named } from "./event-stream.js";
 
-/** @typedef {import("./records.d.ts").Health} Health */
-/** @typedef {import("./records.d.ts").Alarm} Alarm */
+/** @import { Alarm, Health } from "./records.d.ts" */
 
 export const API = "/api/v1";
 const AGAIN_MS = 5_000;

@@ -1,9 +1,7 @@
 /** Names and urgency of states, and the most critical reading of a machine. */
 import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figures.js";
 
-/** @typedef {import("./records.d.ts").Health} Health */
-/** @typedef {import("./records.d.ts").Alarm} Alarm */
-/** @typedef {import("./records.d.ts").ChannelLevels} ChannelLevels */
+/** @import { Alarm, ChannelLevels, Health } from "./records.d.ts" */
 /** @typedef {Pick<import("./records.d.ts").LevelLimits, "measure" | "alert" | "danger" | "fall">} LevelLimits */
 /** @typedef {{title: string, value: string, limit: string, quantity: string, series: string, range: number[]}} Worst */
 

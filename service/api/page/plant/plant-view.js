@@ -7,8 +7,8 @@ import "./site-section.js";
 const KEPT = "rotorwatch.order";
 const byName = new Intl.Collator(undefined, { numeric: true }).compare;
 
-/** @typedef {import("../monitor/records.d.ts").Health} Health */
-/** @typedef {import("./site-section.js").Machine} Machine */
+/** @import { Health } from "../monitor/records.d.ts" */
+/** @import { Machine } from "./site-section.js" */
 
 /** Age of the newest data in whole minutes, so that machines with continuous data keep their places. @param {Machine} machine */
 const minutes = ({ place }) => Math.floor((monitor.dataAge(place) ?? Infinity) / 60);

@@ -3,7 +3,7 @@ import { html, svg } from "../elements/markup.js";
 import { plane, REACH, roundUp } from "./plane.js";
 import { SamplePlot } from "./sample-plot.js";
 
-/** @typedef {import("../monitor/records.d.ts").CentrelineSeries} Centrelines */
+/** @import { CentrelineSeries as Centrelines } from "../monitor/records.d.ts" */
 
 /** Average shaft centreline at each location with two displacements. @extends {SamplePlot<Centrelines>} */
 class CentrelinePlot extends SamplePlot {

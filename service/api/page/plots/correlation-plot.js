@@ -6,9 +6,7 @@ import "../elements/line-chart.js";
 
 const REFRESH_S = 15;
 
-/** @typedef {import("../monitor/records.d.ts").CorrelationSnapshot} Correlations */
-
-/** @typedef {import("../monitor/records.d.ts").CorrelationPair} Pair */
+/** @import { CorrelationPair as Pair, CorrelationSnapshot as Correlations } from "../monitor/records.d.ts" */
 
 /** @param {Pair} pair */
 export const pairName = ({ first, second }) => (first === second ? `${first} with itself` : `${first} and ${second}`);

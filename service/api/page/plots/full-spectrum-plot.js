@@ -4,7 +4,7 @@ import "../elements/line-chart.js";
 
 const ORDERS = 5;
 
-/** @typedef {import("../monitor/records.d.ts").FullSpectrumSnapshot} FullSpectra */
+/** @import { FullSpectrumSnapshot as FullSpectra } from "../monitor/records.d.ts" */
 
 /** Full spectra, forward and reverse, at each location with two displacements. @extends {SamplePlot<FullSpectra>} */
 class FullSpectrumPlot extends SamplePlot {

@@ -5,9 +5,7 @@ import { plane, REACH, roundUp } from "./plane.js";
 
 const [REFRESH_S, REVOLUTIONS] = [15, 8];
 
-/** @typedef {import("../monitor/records.d.ts").OrbitEllipse} Ellipse */
-/** @typedef {import("../monitor/records.d.ts").PlaceOrbit} PlaceOrbit */
-/** @typedef {import("../monitor/records.d.ts").OrbitSnapshot} Orbits */
+/** @import { OrbitEllipse as Ellipse, OrbitSnapshot as Orbits, PlaceOrbit } from "../monitor/records.d.ts" */
 
 /** Positions of the shaft at the pulses of the phase reference. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
 function marked({ path }, pulses_s) {

@@ -5,7 +5,7 @@ import { monitor } from "../monitor/monitor.js";
 
 const RECORDINGS = 40;
 
-/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
+/** @import { Sensor } from "../machine/machine-file.js" */
 /** @typedef {{source: string, reason: string}} Values */
 
 /**

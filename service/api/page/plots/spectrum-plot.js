@@ -5,8 +5,7 @@ import "../elements/line-chart.js";
 
 const [REFRESH_S, ORDERS] = [15, 5];
 
-/** @typedef {import("../monitor/records.d.ts").SpectrumSnapshot} Spectra */
-/** @typedef {import("../monitor/records.d.ts").WaterfallSnapshot} Waterfall */
+/** @import { SpectrumSnapshot as Spectra, WaterfallSnapshot as Waterfall } from "../monitor/records.d.ts" */
 
 /** Common parts of spectra: axes and orders. @param {number[]} lines @param {number | null} turning Hz @param {string} unit */
 function frame(lines, turning, unit) {

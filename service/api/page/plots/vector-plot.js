@@ -5,7 +5,7 @@ import { plane, REACH, roundUp } from "./plane.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.d.ts").VectorSeries} Vectors */
+/** @import { VectorSeries as Vectors } from "../monitor/records.d.ts" */
 
 const rpm = (/** @type {number | null} */ speed) => Math.abs((speed ?? 0) * 30) / Math.PI;
 

@@ -2,7 +2,7 @@ import { clock, figure, quantity, stretch } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 
-/** @typedef {import("../monitor/records.d.ts").WaterfallSnapshot} Waterfall */
+/** @import { WaterfallSnapshot as Waterfall } from "../monitor/records.d.ts" */
 
 const DECADES = 3;
 

@@ -2,7 +2,7 @@ import { quantity, stretch } from "../monitor/figures.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
-/** @typedef {import("../monitor/records.d.ts").WaveformSnapshot} Waveforms */
+/** @import { WaveformSnapshot as Waveforms } from "../monitor/records.d.ts" */
 
 /** The newest revolutions at one location, channel by channel, with the pulses of the phase reference. @extends {SamplePlot<Waveforms>} */
 class WaveformPlot extends SamplePlot {

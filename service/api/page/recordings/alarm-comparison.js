@@ -8,8 +8,7 @@ const EVENTS = 1000;
 /** Largest time between two events of one alarm and kind that count as the same: windows of a replay may end at other times than the live ones. */
 const SAME_NS = 120e9;
 
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
+/** @import { AlarmEventData as AlarmEvent, ReplayJob } from "../monitor/records.d.ts" */
 
 /**
  * Events of both lists in order of time; matching events are paired.

@@ -12,10 +12,7 @@ import "./window-plots.js";
 const [WINDOWS, EVENTS, WAIT_MS] = [600, 1000, 120];
 const RAISED = new Set(["raised", "escalated"]);
 
-/** @typedef {import("../monitor/records.d.ts").Report} Report */
-/** @typedef {import("../monitor/records.d.ts").Health} Health */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
+/** @import { AlarmEventData as AlarmEvent, Health, ReplayJob, Report } from "../monitor/records.d.ts" */
 
 /** Results of an offline replay: state, parameters and levels over time, alarms, and the report of any window. */
 class OfflineResult extends HTMLElement {

@@ -6,7 +6,7 @@ import "./window-plots.js";
 
 const FOLLOW_MS = 15_000;
 
-/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
+/** @import { ReplayJob } from "../monitor/records.d.ts" */
 
 /** Controls of a paced replay on the network: pause, resume, seek. */
 class PacedControl extends HTMLElement {

@@ -6,9 +6,8 @@ import "../elements/state-mark.js";
 const [WIDTH, HEIGHT, LEAST, SHOWN, AROUND_S] = [1000, 26, 2, 10, 600];
 const RANGES = /** @type {[string, string][]} */ ([["", "everything shown below"], ["720", "last 30 days"], ["24", "last 24 h"], ["1", "last hour"]]);
 
-/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("./recordings-view.js").Chosen} Chosen */
+/** @import { AlarmEventData as AlarmEvent, RecordingEntry } from "../monitor/records.d.ts" */
+/** @import { Chosen } from "./recordings-view.js" */
 
 /** Recordings on a time line, with the machine's alarms above; clicking an alarm selects the recordings around it. */
 class RecordingLine extends HTMLElement {

@@ -4,9 +4,8 @@ import { API } from "../monitor/monitor.js";
 
 const PAGE = 25;
 
-/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("./recordings-view.js").Chosen} Chosen */
+/** @import { AlarmEventData as AlarmEvent, RecordingEntry } from "../monitor/records.d.ts" */
+/** @import { Chosen } from "./recordings-view.js" */
 
 /** Recordings, the latest first, to choose from and to download. */
 class RecordingTable extends HTMLElement {

@@ -8,8 +8,7 @@ import "./replay-order.js";
 
 const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
 
-/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
+/** @import { AlarmEventData as AlarmEvent, RecordingEntry } from "../monitor/records.d.ts" */
 /** Selection for a replay: ids of recordings, and a stretch of time if not everything. @typedef {{ids: Set<string>, stretch: [number, number] | null}} Chosen */
 
 /** Recordings of one machine with its alarms, and replays of them. */

@@ -5,7 +5,7 @@ import { API, monitor } from "../monitor/monitor.js";
 
 const REFRESH_S = 10;
 
-/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
+/** @import { ReplayJob } from "../monitor/records.d.ts" */
 
 /** Differences of a replay from live operation. @param {ReplayJob} job */
 export const differences = (job) => [job.machine && `${job.machine_file_sent ? "another machine file, " : "machine file "}${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");

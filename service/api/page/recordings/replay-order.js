@@ -5,9 +5,8 @@ import { counted } from "./replay-list.js";
 
 const LARGEST = 100_000;
 
-/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("./recordings-view.js").Chosen} Chosen */
+/** @import { AlarmEventData as AlarmEvent, RecordingEntry } from "../monitor/records.d.ts" */
+/** @import { Chosen } from "./recordings-view.js" */
 
 /** A form that starts a replay of the selection: unchanged, or with another machine file (also a local one) or another limit. */
 class ReplayOrder extends HTMLElement {

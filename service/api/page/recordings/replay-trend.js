@@ -1,10 +1,8 @@
 import { LevelTrend } from "../machine/level-trend.js";
 import { ParameterTrend } from "../machine/parameter-trend.js";
 
-/** @typedef {import("../monitor/records.d.ts").Report} Report */
-/** @typedef {import("../monitor/records.d.ts").AlarmEventData} AlarmEvent */
-/** @typedef {import("../monitor/records.d.ts").ReadingBucket} Bucket */
-/** @typedef {import("../machine/reading-trend.js").Trended} Trended */
+/** @import { AlarmEventData as AlarmEvent, ReadingBucket as Bucket, Report } from "../monitor/records.d.ts" */
+/** @import { Trended } from "../machine/reading-trend.js" */
 /** Results of a replay. @typedef {{reports: Report[], events: AlarmEvent[], limits: Record<string, {raise_above: number, danger_above: number}>}} Found */
 
 /** @param {string} name @param {Report} report @param {number | null} value @param {number | null} error @returns {Bucket[]} */

@@ -8,7 +8,7 @@ import "./paced-control.js";
 
 const ENDED = new Set(["finished", "stopped", "failed"]);
 
-/** @typedef {import("../monitor/records.d.ts").ReplayJob} ReplayJob */
+/** @import { ReplayJob } from "../monitor/records.d.ts" */
 
 /** One replay, framed and under a banner, so that nobody takes it for live data. */
 class ReplayView extends LiveElement {

@@ -6,7 +6,7 @@ import "../elements/state-mark.js";
 
 const [WIDTH, HEIGHT, OPEN] = [1000, 26, 12];
 
-/** @typedef {import("../monitor/records.d.ts").Report} Report */
+/** @import { Report } from "../monitor/records.d.ts" */
 
 /** The state of a machine over time, as a strip and in words. */
 class StateStrip extends HTMLElement {

@@ -1,5 +1,4 @@
-/** @typedef {import("../monitor/records.d.ts").RecordingEntry} RecordingEntry */
-/** @typedef {import("../monitor/records.d.ts").Report} Report */
+/** @import { RecordingEntry, Report } from "../monitor/records.d.ts" */
 /** @typedef {{state: string, from: number, to: number, at: number}} Run */
 
 /** Ids of the recordings that can be replayed and have data within a stretch of time. @param {RecordingEntry[]} recordings @param {number} from @param {number} to @returns {Set<string>} */
