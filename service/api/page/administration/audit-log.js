@@ -3,7 +3,7 @@ import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-const [PAGE, REFRESH_S] = [50, 15];
+const PAGE = 50;
 
 /** @import { AuditRecord } from "../monitor/records.d.ts" */
 
@@ -20,15 +20,14 @@ class AuditLog extends LiveElement {
   #entries = [];
   /** @type {number | null} */
   #before = null;
-  #message = html("p", { class: "message", role: "status" });
+  refreshS = 15;
   #rows = html("div");
   #older = html("button", { type: "button", hidden: true, click: () => this.#extend() }, "Older");
 
   connectedCallback() {
     super.connectedCallback();
     this.#entries = [];
-    this.replaceChildren(this.#message, this.#rows, this.#older);
-    this.keepLoading(REFRESH_S);
+    this.replaceChildren(this.message, this.#rows, this.#older);
   }
 
   async ask() {
@@ -38,7 +37,7 @@ class AuditLog extends LiveElement {
     if (newer.length === PAGE || known < 0) [this.#entries, this.#before] = [newer, found.next_before]; // there may be further entries in between
     else this.#entries.unshift(...newer);
     if (newer.length || known < 0) this.#show();
-    this.#message.textContent = "";
+    this.message.textContent = "";
   }
 
   async #extend() {
@@ -50,11 +49,6 @@ class AuditLog extends LiveElement {
     } catch (error) {
       this.refused(error instanceof Error ? error.message : String(error));
     }
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#message.textContent = why;
   }
 
   #show() {

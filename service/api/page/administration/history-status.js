@@ -3,16 +3,12 @@ import { clock, size } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-const REFRESH_S = 60;
-
 /** @import { HistoryStatus } from "../monitor/records.d.ts" */
 
 /** Size, time span and retention of the history. */
 class HistoryStatusTable extends LiveElement {
-  connectedCallback() {
-    super.connectedCallback();
-    this.keepLoading(REFRESH_S);
-  }
+  refreshS = 60;
+  heading = "History";
 
   async ask() {
     const found = /** @type {HistoryStatus} */ (await monitor.ask(`${API}/history`));
@@ -21,15 +17,10 @@ class HistoryStatusTable extends LiveElement {
     const fact = (/** @type {string} */ name, /** @type {string} */ text) => [html("dt", {}, name), html("dd", {}, text)];
     lay(
       this,
-      html("h2", {}, "History"),
+      html("h2", {}, this.heading),
       html("dl", {}, ...fact("database", found.database), ...fact("size", size(found.size_bytes)), ...fact("alarm events", "kept for ever"), ...fact("full reports", `kept for ${found.reports_days} days`), ...fact("readings of each window", `kept for ${found.readings_days} days`), ...fact("reduced readings", `kept for ${found.buckets_days} days`)),
       rows.length ? table(["machine", "alarm event", "report", "reading"], rows, "Oldest data, by machine") : html("p", { class: "note" }, "Nothing is stored for any machine yet."),
     );
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    lay(this, html("h2", {}, "History"), html("p", { class: "message", role: "status" }, why));
   }
 }
 

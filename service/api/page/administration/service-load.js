@@ -1,22 +1,21 @@
-import { html, lay, renew, table } from "../elements/markup.js";
+import { html, renew, table } from "../elements/markup.js";
 import { lasting } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { monitor, Refused } from "../monitor/monitor.js";
 import "../elements/state-mark.js";
 
-const REFRESH_S = 10;
-
 /** @import { Readiness } from "../monitor/records.d.ts" */
 
 /** Readiness of the service, and the load of each machine's monitor. */
 class ServiceLoad extends LiveElement {
+  refreshS = 10;
+  heading = "Service";
   /** Machines whose health had not arrived when they were shown. @type {Set<string>} */
   #unheard = new Set();
 
   connectedCallback() {
     super.connectedCallback();
     this.follow("health", ({ detail }) => this.#unheard.has(detail) && this.load());
-    this.keepLoading(REFRESH_S);
   }
 
   async ask() {
@@ -26,11 +25,6 @@ class ServiceLoad extends LiveElement {
       if (!(error instanceof Refused) || !error.body.machines) throw error;
       this.#show(error.body); // not ready; the body states the reasons
     }
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    lay(this, html("h2", {}, "Service"), html("p", { class: "message", role: "status" }, why));
   }
 
   /** @param {Readiness} found */
@@ -61,7 +55,7 @@ class ServiceLoad extends LiveElement {
     const heads = ["machine", "state", "age of data", "blocks waiting", "at work", "dropped (overload)", "lost in transit", "steps not in history", "recording", "trouble"];
     renew(
       this,
-      html("h2", {}, "Service"),
+      html("h2", {}, this.heading),
       html("p", {}, found.ready ? "Ready: everything that monitoring needs is working." : html("strong", {}, "Not ready.")),
       html("ul", {}, ...[...found.reasons, ...found.failing_webhooks.map((one) => `webhook ${one}`)].map((one) => html("li", {}, one))),
       rows.length ? table(heads, rows, "Lag and load by machine") : null,

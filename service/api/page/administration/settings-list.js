@@ -6,6 +6,8 @@ import { API, monitor } from "../monitor/monitor.js";
 
 /** The settings of the monitor as they are in use. */
 class SettingTable extends LiveElement {
+  heading = "Settings";
+
   connectedCallback() {
     super.connectedCallback();
     this.load();
@@ -14,12 +16,7 @@ class SettingTable extends LiveElement {
   async ask() {
     const { settings } = /** @type {SettingList} */ (await monitor.ask(`${API}/settings`));
     const rows = Object.entries(settings).flatMap(([part, fields]) => Object.entries(fields).map(([name, value]) => ({ cells: [`[${part}] ${name}`, html("span", {}, value === null ? "left out" : `${value}`)] })));
-    lay(this, html("h2", {}, "Settings"), table(["setting", "value"], rows, "Settings in use, except machines, access, webhooks, history, fleet and Zenoh"));
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    lay(this, html("h2", {}, "Settings"), html("p", { class: "message", role: "status" }, why));
+    lay(this, html("h2", {}, this.heading), table(["setting", "value"], rows, "Settings in use, except machines, access, webhooks, history, fleet and Zenoh"));
   }
 }
 

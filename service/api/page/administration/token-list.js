@@ -3,7 +3,7 @@ import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-const [REFRESH_S, DAYS] = [30, 90];
+const DAYS = 90;
 const TOKENS = `${API}/tokens`;
 const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate", "acknowledge, shelve and reset alarms, start replays"], ["configure", "take alarms out of service, administer"]]);
 
@@ -12,7 +12,7 @@ const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate",
 /** Tokens of the service, with a form to create one, and a button to revoke each. */
 class TokenTable extends LiveElement {
   #open = html("p", { hidden: true }, "The API is open on this computer: anyone who can log in here may do everything, without a token. Tokens can already be created for later.");
-  #message = html("p", { class: "message", role: "status" });
+  refreshS = 30;
   #made = html("div", { class: "made", hidden: true });
   #rows = html("div");
   #name = /** @type {HTMLInputElement} */ (html("input", { required: true, maxlength: 64, autocomplete: "off" }));
@@ -27,7 +27,7 @@ class TokenTable extends LiveElement {
     this.replaceChildren(
       html("h2", {}, "Access tokens"),
       this.#open,
-      this.#message,
+      this.message,
       this.#made,
       this.#rows,
       html(
@@ -40,7 +40,6 @@ class TokenTable extends LiveElement {
         html("button", { type: "submit", class: "main" }, "Create token"),
       ),
     );
-    this.keepLoading(REFRESH_S);
   }
 
   async ask() {
@@ -66,11 +65,6 @@ class TokenTable extends LiveElement {
     renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "") : html("p", { class: "note" }, "There are no tokens."));
   }
 
-  /** @param {string} why */
-  refused(why) {
-    this.#message.textContent = why;
-  }
-
   /** @param {Event} event */
   async #create(event) {
     event.preventDefault();
@@ -78,7 +72,7 @@ class TokenTable extends LiveElement {
     const days = this.#days.value ? Number(this.#days.value) : null;
     try {
       const { token, text } = await monitor.order(TOKENS, { name: this.#name.value.trim(), scopes, days });
-      this.#message.textContent = "";
+      this.message.textContent = "";
       this.#name.value = "";
       this.#show(token, text);
       await this.load();
@@ -131,7 +125,7 @@ class TokenTable extends LiveElement {
     if (dialog.returnValue !== "do") return;
     try {
       await monitor.ask(`${TOKENS}/${token.token_id}`, { method: "DELETE" });
-      this.#message.textContent = `The token of ${token.name} is revoked.`;
+      this.message.textContent = `The token of ${token.name} is revoked.`;
       await this.load();
     } catch (error) {
       this.refused(`Not revoked. ${error instanceof Error ? error.message : String(error)}`);

@@ -3,16 +3,11 @@ import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-const REFRESH_S = 15;
-
 /** @import { WebhookStatus } from "../monitor/records.d.ts" */
 
 /** Webhooks, with the last event that each accepted, and its last error. */
 class WebhookTable extends LiveElement {
-  connectedCallback() {
-    super.connectedCallback();
-    this.keepLoading(REFRESH_S);
-  }
+  refreshS = 15;
 
   async ask() {
     const found = /** @type {WebhookStatus[]} */ ((await monitor.ask(`${API}/webhooks`)).webhooks);
@@ -29,11 +24,6 @@ class WebhookTable extends LiveElement {
     }));
     const heads = ["webhook", "state", "receives", "delivered", "pending", "last delivery", "last error"];
     lay(this, rows.length ? table(heads, rows, "Webhooks, since the monitor started") : html("div", {}, html("h2", {}, "Webhooks"), html("p", { class: "note" }, "The settings name no webhook: no alarm events are posted over HTTP.")));
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    lay(this, html("p", { class: "message", role: "status" }, why));
   }
 }
 

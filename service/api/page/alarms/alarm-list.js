@@ -1,5 +1,6 @@
 import { clock, interval, percent } from "../monitor/figures.js";
 import { html, lay, renew, table } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { monitor, Refused } from "../monitor/monitor.js";
 import { byUrgency, UNSEEN } from "../monitor/states.js";
 import { ordered } from "./alarm-order.js";
@@ -43,10 +44,8 @@ function operations(alarm) {
 }
 
 /** Alarms that are not normal, with buttons for actions: of all machines, of one `place="site/machine"`, or one `alarm="k_by"` of it. */
-class AlarmList extends HTMLElement {
-  #gone = new AbortController();
+class AlarmList extends LiveElement {
   #said = "";
-  #message = html("p", { role: "status", class: "message" });
   #rows = html("div");
   #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#show() }, html("option", { value: "" }, "most urgent first"), html("option", { value: "first-out" }, "first out: in order of occurrence")));
   #together = html("div", { class: "tools" });
@@ -54,18 +53,13 @@ class AlarmList extends HTMLElement {
   #chosen = new Set();
 
   connectedCallback() {
-    this.#gone = new AbortController();
+    super.connectedCallback();
     const place = this.getAttribute("place");
-    const heard = { signal: this.#gone.signal };
-    monitor.addEventListener(place ? `health:${place}` : "health", () => this.#show(), heard);
-    monitor.addEventListener("connection", () => this.#show(), heard);
-    lay(this, this.#message, !this.hasAttribute("alarm") && this.#together, this.#rows);
+    this.follow(place ? `health:${place}` : "health", () => this.#show());
+    this.follow("connection", () => this.#show());
+    lay(this, this.message, !this.hasAttribute("alarm") && this.#together, this.#rows);
     this.#said = "";
     this.#show();
-  }
-
-  disconnectedCallback() {
-    this.#gone.abort();
   }
 
   /** @returns {Placed[]} */
@@ -146,7 +140,7 @@ class AlarmList extends HTMLElement {
         said.push(`${what}: not done. ${error instanceof Refused ? error.message : String(error)}`);
       }
     }
-    this.#message.textContent = said.join(" ");
+    this.message.textContent = said.join(" ");
     this.#show();
   }
 }

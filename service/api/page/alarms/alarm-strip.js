@@ -1,5 +1,6 @@
 import { clock } from "../monitor/figures.js";
 import { html, renew } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { monitor } from "../monitor/monitor.js";
 import { byUrgency, stands, UNSEEN } from "../monitor/states.js";
 import { why } from "./why-link.js";
@@ -15,19 +16,14 @@ export function standing() {
 }
 
 /** The most urgent alarms of the plant in a few lines, unacknowledged ones first. */
-class AlarmStrip extends HTMLElement {
-  #gone = new AbortController();
+class AlarmStrip extends LiveElement {
   #said = "";
 
   connectedCallback() {
-    this.#gone = new AbortController();
-    monitor.addEventListener("health", () => this.#show(), { signal: this.#gone.signal });
+    super.connectedCallback();
+    this.follow("health", () => this.#show());
     this.#said = "";
     this.#show();
-  }
-
-  disconnectedCallback() {
-    this.#gone.abort();
   }
 
   #show() {

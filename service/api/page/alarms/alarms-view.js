@@ -1,27 +1,23 @@
 import { html } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { monitor } from "../monitor/monitor.js";
 import { standing } from "./alarm-strip.js";
 import "./alarm-history.js";
 import "./alarm-list.js";
 
 /** Alarms of the whole plant: those that are not normal, and the history of one machine. */
-class AlarmsView extends HTMLElement {
-  #gone = new AbortController();
+class AlarmsView extends LiveElement {
   #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Machine", change: () => this.#choose() }));
   #chosen = "";
   #history = html("div");
   #rights = html("p", { class: "note" });
 
   connectedCallback() {
-    this.#gone = new AbortController();
+    super.connectedCallback();
     this.replaceChildren(html("h1", {}, "Alarms"), this.#rights, html("alarm-list"), html("div", { class: "tools" }, html("h2", {}, "History"), this.#choice), this.#history);
-    monitor.addEventListener("health", () => this.#offer(), { signal: this.#gone.signal });
-    monitor.addEventListener("connection", () => this.#offer(), { signal: this.#gone.signal });
+    this.follow("health", () => this.#offer());
+    this.follow("connection", () => this.#offer());
     this.#offer();
-  }
-
-  disconnectedCallback() {
-    this.#gone.abort();
   }
 
   /** Offer all known machines; initially, the one with the most urgent alarm is selected. */

@@ -1,3 +1,4 @@
+import { html, lay } from "./markup.js";
 import { monitor } from "../monitor/monitor.js";
 
 /** An element that listens to the monitor and requests data periodically while it is on the page. */
@@ -8,12 +9,19 @@ export class LiveElement extends HTMLElement {
   #unseen = false;
   /** Whether the last request was answered. */
   answered = false;
+  /** Seconds between requests; 0 for an element that does not request periodically. */
+  refreshS = 0;
+  /** Heading of an element that has nothing else to show as long as no request is answered. */
+  heading = "";
+  /** Says why there are no new data; an element that does not place it in its content is replaced by it. */
+  message = html("p", { class: "message", role: "status", "data-key": "message" });
 
   connectedCallback() {
     this.#gone = new AbortController();
     this.#unseen = false;
     // A load skipped while the page was hidden is done as soon as it is visible.
     document.addEventListener("visibilitychange", () => this.#unseen && !document.hidden && this.load(), { signal: this.#gone.signal });
+    if (this.refreshS) this.keepLoading();
   }
 
   disconnectedCallback() {
@@ -31,9 +39,9 @@ export class LiveElement extends HTMLElement {
     this.#gone.signal.addEventListener("abort", () => clearInterval(timer));
   }
 
-  /** Load now, and then periodically while the element is on the page. @param {number} every_s */
-  keepLoading(every_s) {
-    this.repeat(every_s, () => this.load());
+  /** Load now, and then periodically while the element is on the page. */
+  keepLoading() {
+    this.repeat(this.refreshS, () => this.load());
     this.load();
   }
 
@@ -58,6 +66,9 @@ export class LiveElement extends HTMLElement {
   /** Request data from the monitor, and show the answer. */
   async ask() {}
 
-  /** Show why there are no new data. @param {string} _why */
-  refused(_why) {}
+  /** Show why there are no new data. @param {string} why */
+  refused(why) {
+    this.message.textContent = why;
+    if (!this.contains(this.message)) lay(this, this.heading && html("h2", {}, this.heading), this.message);
+  }
 }

@@ -40,9 +40,9 @@ export class MachineElement extends LiveElement {
     if (this.isConnected) this.load();
   }
 
-  /** Load periodically; recorded data do not change, and are only requested until they have arrived. @param {number} every_s */
-  keepLoading(every_s) {
-    this.repeat(every_s, () => (this.recorded && this.answered) || this.load());
+  /** Load periodically; recorded data do not change, and are only requested until they have arrived. */
+  keepLoading() {
+    this.repeat(this.refreshS, () => (this.recorded && this.answered) || this.load());
     this.load();
   }
 

@@ -15,6 +15,7 @@ function facts(value, name) {
 /** The machine file in use, line by line. */
 class MachineFacts extends MachineElement {
   needsFile = true;
+  message = html("p", { class: "note" });
   /** @type {unknown} */
   #shown = null;
 
@@ -25,11 +26,6 @@ class MachineFacts extends MachineElement {
       html("p", { class: "note" }, `The machine file in use, with its defaults filled in; units are in the names. Identity ${this.health?.machine_hash}.`),
       html("dl", { class: "facts" }, ...facts(this.file, "").flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])),
     );
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.replaceChildren(html("p", { class: "note" }, why));
   }
 }
 

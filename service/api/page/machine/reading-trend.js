@@ -4,7 +4,7 @@ import { monitor, pathOf } from "../monitor/monitor.js";
 import { GAP, shortest, stretch, Z95 } from "../monitor/figures.js";
 import "../elements/line-chart.js";
 
-const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
+const [POINTS, EVENTS] = [240, 200];
 
 /** @import { AlarmEventData as AlarmEvent, ReadingBucket as Bucket } from "../monitor/records.d.ts" */
 /** @typedef {{at: number, kind: "alert" | "danger", text: string, below?: boolean}} Limit */
@@ -12,6 +12,7 @@ const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
 export class ReadingTrend extends MachineElement {
+  refreshS = 15;
   quantity = "";
   title = "";
   /** What the band shows, and remarks on the limits. */
@@ -21,7 +22,7 @@ export class ReadingTrend extends MachineElement {
   /** @type {Map<string, any>} */
   #charts = new Map();
   #figures = html("div", { class: "charts" });
-  #message = html("p", { class: "message" });
+  message = html("p", { class: "message" });
   #when = html("p", { class: "note" });
   /** The data loaded last. @type {{shown: Trended[], buckets: Bucket[], events: AlarmEvent[]}} */
   #read = { shown: [], buckets: [], events: [] };
@@ -30,9 +31,8 @@ export class ReadingTrend extends MachineElement {
 
   connectedCallback() {
     super.connectedCallback();
-    this.replaceChildren(html("h2", {}, this.title), this.#when, this.#message, this.#figures);
+    this.replaceChildren(html("h2", {}, this.title), this.#when, this.message, this.#figures);
     this.follow("alarm", ({ detail }) => `${detail.site}/${detail.machine}` === this.place && this.load());
-    this.keepLoading(REFRESH_S);
   }
 
   /**
@@ -85,12 +85,7 @@ export class ReadingTrend extends MachineElement {
     for (const one of shown) this.#draw(one, buckets.filter((bucket) => bucket.name === one.name), events);
     const ends = buckets.map((bucket) => bucket.start_ns + bucket.length_ns);
     if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for the mean of several; ${this.note}`;
-    this.#message.textContent = buckets.length ? "" : "Nothing has been read yet.";
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#message.textContent = why;
+    this.message.textContent = buckets.length ? "" : "Nothing has been read yet.";
   }
 
   /** @param {Trended} one @param {Bucket[]} buckets @param {AlarmEvent[]} events */

@@ -1,4 +1,5 @@
 import { arrange, html } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { monitor } from "../monitor/monitor.js";
 import { STATES, stands, urgency } from "../monitor/states.js";
 import "../alarms/alarm-strip.js";
@@ -24,8 +25,7 @@ const ORDERS = {
 const apart = (health) => (health.state === "no-data" || health.stream.data_age_s === null) && !health.alarms.some((one) => stands(one) && one.name !== "stream-lost");
 
 /** Tiles of all machines, by site; machines without data and without an alarm are shown apart. */
-class PlantView extends HTMLElement {
-  #gone = new AbortController();
+class PlantView extends LiveElement {
   /** @type {Map<string, HTMLElement>} */
   #sections = new Map();
   /** @type {Map<string, HTMLElement>} */
@@ -40,7 +40,7 @@ class PlantView extends HTMLElement {
   #none = html("p", { class: "note", hidden: true });
 
   connectedCallback() {
-    this.#gone = new AbortController();
+    super.connectedCallback();
     this.replaceChildren(
       html("alarm-strip"),
       html("div", { class: "tools" }, html("h1", {}, "Plant"), this.#search, this.#filter, this.#order),
@@ -48,12 +48,8 @@ class PlantView extends HTMLElement {
       this.#sites,
       this.#apart,
     );
-    monitor.addEventListener("health", () => this.#arrange(), { signal: this.#gone.signal });
+    this.follow("health", () => this.#arrange());
     this.#arrange();
-  }
-
-  disconnectedCallback() {
-    this.#gone.abort();
   }
 
   #reorder() {

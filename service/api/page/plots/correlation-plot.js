@@ -4,8 +4,6 @@ import { MachineElement } from "../elements/machine-element.js";
 import { choiceOf, offered } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
-const REFRESH_S = 15;
-
 /** @import { CorrelationPair as Pair, CorrelationSnapshot as Correlations } from "../monitor/records.d.ts" */
 
 /** @param {Pair} pair */
@@ -20,17 +18,17 @@ export function measuredLines(pair, line) {
 
 /** Correlation functions of a window beside theory, and the residuals of the equations between them. */
 class CorrelationPlot extends MachineElement {
+  refreshS = 15;
   #choice = choiceOf("Pair of channels", () => this.#draw());
   /** @type {Correlations | null} */
   #found = null;
-  #said = html("p", { class: "note", role: "status" });
+  message = html("p", { class: "note", role: "status" });
   #chart = /** @type {any} */ (html("line-chart", { role: "img", "aria-label": "correlation function" }));
   #residuals = html("div");
 
   connectedCallback() {
     super.connectedCallback();
-    this.replaceChildren(html("div", { class: "tools" }, this.#choice), this.#said, html("figure", {}, this.#chart), this.#residuals);
-    this.keepLoading(REFRESH_S);
+    this.replaceChildren(html("div", { class: "tools" }, this.#choice), this.message, html("figure", {}, this.#chart), this.#residuals);
   }
 
   async ask() {
@@ -46,20 +44,15 @@ class CorrelationPlot extends MachineElement {
     this.#chart.parentElement.hidden = this.#choice.hidden = !pair;
     const theory = [...new Set([found.theory.nominal_reason || found.theory.estimated_reason, found.reason])].filter(Boolean);
     if (!pair || !found.start_ns || !found.end_ns) {
-      this.#said.textContent = [this.windowText(found), ...theory].filter(Boolean).join("; ");
+      this.message.textContent = [this.windowText(found), ...theory].filter(Boolean).join("; ");
       return;
     }
     const apart = [pair.nominal_z !== null && `nominal ${figure(pair.nominal_z)}`, pair.estimated_z !== null && `estimated ${figure(pair.estimated_z)}`].filter(Boolean);
-    this.#said.textContent = [`${this.windowText(found) || `Window ${stretch(found.start_ns, found.end_ns)}`}, without mean${found.speed_rad_s === null ? "" : " and 1×"}`, apart.length && `distance from theory in standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
+    this.message.textContent = [`${this.windowText(found) || `Window ${stretch(found.start_ns, found.end_ns)}`}, without mean${found.speed_rad_s === null ? "" : " and 1×"}`, apart.length && `distance from theory in standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
     const lines = measuredLines(pair, { label: "measured", values: pair.measured, width: 2 });
     if (pair.nominal) lines.push({ label: "as nominal", values: pair.nominal, colour: "nominal", dash: [6, 4] });
     if (pair.estimated) lines.push({ label: "as estimated", values: pair.estimated, colour: "estimated" });
     this.#chart.draw({ x: found.lags_s.map((lag) => 1000 * lag), lines, band: [2, 1], marks: [], time: false, include: [0], unit: printed(pair.unit), xUnit: "lag, ms", height: 240 });
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#said.textContent = why;
   }
 
   /** The residuals come with every report. */

@@ -3,7 +3,7 @@ import { html, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { plane, REACH, roundUp } from "./plane.js";
 
-const [REFRESH_S, REVOLUTIONS] = [15, 8];
+const REVOLUTIONS = 8;
 
 /** @import { OrbitEllipse as Ellipse, OrbitSnapshot as Orbits, PlaceOrbit } from "../monitor/records.d.ts" */
 
@@ -50,21 +50,14 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
 
 /** Orbits of a window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
 class OrbitPlot extends MachineElement {
-  connectedCallback() {
-    super.connectedCallback();
-    this.keepLoading(REFRESH_S);
-  }
+  refreshS = 15;
+  message = html("p", { class: "note" });
 
   async ask() {
     const found = /** @type {Orbits} */ (await this.askFor("orbits", `revolutions=${REVOLUTIONS}`));
     const drawn = found.orbits.filter((one) => one.ellipse || one.path);
     const reasons = [...new Set([this.windowText(found), found.reason, found.path_reason])].filter(Boolean).join("; ");
     this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => orbitFigure(one, found.pulses_s))), html("p", { class: "note" }, reasons));
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.replaceChildren(html("p", { class: "note" }, why));
   }
 }
 

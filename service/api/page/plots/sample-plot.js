@@ -22,19 +22,18 @@ export class SamplePlot extends MachineElement {
   /** @type {Sensor[]} */
   sensors = [];
   body = html("div");
-  #said = html("p", { class: "note", role: "status" });
+  message = html("p", { class: "note", role: "status" });
   #shown = "";
   /** @type {Map<string, HTMLElement>} */
   #charts = new Map();
   #source = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Samples of", change: () => this.load() }));
 
   connectedCallback() {
-    super.connectedCallback();
     this.#source.replaceChildren(html("option", { value: "" }, this.live));
     this.#source.hidden = true;
-    this.replaceChildren(html("div", { class: "tools" }, ...this.choices(), this.#source), this.#said, this.body);
+    this.replaceChildren(html("div", { class: "tools" }, ...this.choices(), this.#source), this.message, this.body);
     if (!this.recorded) this.#offer();
-    this.keepLoading(this.refreshS);
+    super.connectedCallback(); // requests with what is chosen above
   }
 
   /**
@@ -81,22 +80,17 @@ export class SamplePlot extends MachineElement {
     }
     const asked = this.#wanted();
     if (this.#source.value && asked === this.#shown) return;
-    if (this.#source.value) this.#said.textContent = "The recording is being read …";
+    if (this.#source.value) this.message.textContent = "The recording is being read …";
     const found = /** @type {T} */ (await this.askFor(this.route, asked));
     if (asked !== this.#wanted()) return this.ask(); // the selection has changed meanwhile
     this.#shown = asked;
     const said = [this.recorded && "Replay", this.draw(found), found.reason].filter(Boolean).join("; ");
-    this.#said.textContent = said.charAt(0).toUpperCase() + said.slice(1);
+    this.message.textContent = said.charAt(0).toUpperCase() + said.slice(1);
   }
 
   #wanted() {
     const recording = this.#source.value;
     return new URLSearchParams([...this.asked(), ...(recording ? [["recording", recording]] : [])]).toString();
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#said.textContent = why;
   }
 
   /** The newest recordings; empty if none are kept. */

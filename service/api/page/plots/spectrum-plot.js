@@ -3,7 +3,7 @@ import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import "../elements/line-chart.js";
 
-const [REFRESH_S, ORDERS] = [15, 5];
+const ORDERS = 5;
 
 /** @import { SpectrumSnapshot as Spectra, WaterfallSnapshot as Waterfall } from "../monitor/records.d.ts" */
 
@@ -36,14 +36,14 @@ export function spectrumDrawing(found, shown) {
 
 /** Power spectral densities of a window with theory and the orders of running speed. */
 class SpectrumPlot extends MachineElement {
-  #message = html("p", { class: "note" });
+  refreshS = 15;
+  message = html("p", { class: "note" });
   #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel", change: () => this.load() }));
   #chart = /** @type {any} */ (html("line-chart", { role: "img", "aria-label": "spectrum" }));
 
   connectedCallback() {
     super.connectedCallback();
-    this.replaceChildren(html("div", { class: "tools" }, html("h2", {}, "Spectrum"), this.#choice), this.#chart, this.#message);
-    this.keepLoading(REFRESH_S);
+    this.replaceChildren(html("div", { class: "tools" }, html("h2", {}, "Spectrum"), this.#choice), this.#chart, this.message);
   }
 
   async ask() {
@@ -68,12 +68,7 @@ class SpectrumPlot extends MachineElement {
     const turning = speeds.length ? Math.abs(speeds.reduce((sum, one) => sum + one, 0)) / speeds.length / (2 * Math.PI) : 0;
     this.#chart.setAttribute("aria-label", `spectrum of ${channel}`);
     this.#chart.draw({ ...frame(lines, turning, unit), lines: [{ label: "measured", values }], shaded: [] });
-    this.#message.textContent = `Amplitudes in the newest samples, ${stretch(start_ns, end_ns)}, mean of ${rows.length} spectra; lines ${figure(lines[1] - lines[0])} Hz apart`;
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#message.textContent = why;
+    this.message.textContent = `Amplitudes in the newest samples, ${stretch(start_ns, end_ns)}, mean of ${rows.length} spectra; lines ${figure(lines[1] - lines[0])} Hz apart`;
   }
 
   /** @param {Spectra} found */
@@ -83,7 +78,7 @@ class SpectrumPlot extends MachineElement {
     const theory = found.theory;
     // State where 1× is, because it is removed from these spectra.
     const once = shown && found.left_out_hz ? "1× is taken out (shaded: where some of it may be left); it is among the vibration levels" : "";
-    this.#message.textContent = [...new Set([this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason])].filter(Boolean).join("; ");
+    this.message.textContent = [...new Set([this.windowText(found), once, found.reason, theory.nominal_reason || theory.estimated_reason])].filter(Boolean).join("; ");
     if (!shown) return;
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
     this.#chart.draw(spectrumDrawing(found, shown));

@@ -1,5 +1,6 @@
 import { clock, lasting } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { API, monitor, pathOf } from "../monitor/monitor.js";
 import { differences } from "./replay-list.js";
 import "../elements/state-mark.js";
@@ -34,9 +35,8 @@ function where(here, there, other) {
 }
 
 /** Alarms that a replay would have raised, compared with those raised live or by another replay. */
-class AlarmComparison extends HTMLElement {
-  #beside = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#compare() }));
-  #message = html("p", { class: "message", role: "status" });
+class AlarmComparison extends LiveElement {
+  #beside = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.load() }));
   #rows = html("div");
   #place = "";
   /** @type {AlarmEvent[]} */
@@ -50,7 +50,7 @@ class AlarmComparison extends HTMLElement {
   async show(job, events, span, go) {
     [this.#events, this.#span, this.#go] = [events, span, go];
     this.#place = job.recordings[0].split("/").slice(0, 2).join("/");
-    lay(this, html("h2", {}, "What would have been raised"), html("label", {}, "Beside it: ", this.#beside), this.#message, this.#rows);
+    lay(this, html("h2", {}, "What would have been raised"), html("label", {}, "Beside it: ", this.#beside), this.message, this.#rows);
     const all = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
     const same = all.filter((one) => one.id !== job.id && one.summary && one.recordings[0].startsWith(`${this.#place}/`));
     const live = await monitor.find(pathOf(this.#place));
@@ -60,19 +60,15 @@ class AlarmComparison extends HTMLElement {
       ...same.map((one) => html("option", { value: one.id }, `replay of ${clock(one.started_ns)}, ${differences(one) || "as recorded"}`)),
       html("option", { value: "" }, "nothing"),
     );
-    await this.#compare();
+    await this.load();
   }
 
-  async #compare() {
+  async ask() {
     const beside = this.#beside.value;
     const path = beside === "live" ? `${pathOf(this.#place)}/alarms/events?limit=${EVENTS}&since_ns=${this.#span[0]}&until_ns=${this.#span[1] + 1}` : `${API}/replays/${beside}/alarms?limit=${EVENTS}`;
-    try {
-      const found = beside ? (await monitor.ask(path)).events.map((/** @type {{data: AlarmEvent}} */ one) => one.data) : [];
-      this.#message.textContent = "";
-      this.#lay(beside, found);
-    } catch (error) {
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    }
+    const found = beside ? (await monitor.ask(path)).events.map((/** @type {{data: AlarmEvent}} */ one) => one.data) : [];
+    this.message.textContent = "";
+    this.#lay(beside, found);
   }
 
   /** @param {string} beside @param {AlarmEvent[]} others */

@@ -6,7 +6,7 @@ import "./recording-table.js";
 import "./replay-list.js";
 import "./replay-order.js";
 
-const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
+const [LATEST, EVENTS] = [200, 200];
 
 /** @import { AlarmEventData as AlarmEvent, RecordingEntry } from "../monitor/records.d.ts" */
 /** Selection for a replay: ids of recordings, and a stretch of time if not everything. @typedef {{ids: Set<string>, stretch: [number, number] | null}} Chosen */
@@ -14,7 +14,7 @@ const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
 /** Recordings of one machine with its alarms, and replays of them. */
 class RecordingsView extends LiveElement {
   #machine = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Machine", change: () => this.#other() }));
-  #message = html("p", { class: "message", role: "status" });
+  refreshS = 30;
   #line = /** @type {any} */ (html("recording-line"));
   #table = /** @type {any} */ (html("recording-table"));
   #order = /** @type {any} */ (html("replay-order"));
@@ -34,14 +34,13 @@ class RecordingsView extends LiveElement {
         this.#chosen = detail;
         this.#show();
       });
-    lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, ...this.#parts, html("replay-list"));
+    lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.message, ...this.#parts, html("replay-list"));
     let heard = monitor.machines.size;
     this.follow("health", () => {
       if (!this.#said || heard === monitor.machines.size) return; // no statement before recordings have been requested
       heard = monitor.machines.size;
       this.#show();
     });
-    this.keepLoading(REFRESH_S);
   }
 
   #other() {
@@ -57,7 +56,7 @@ class RecordingsView extends LiveElement {
     const chosen = this.#machine.value || decodeURIComponent(this.getAttribute("place") ?? "") || places[0];
     if (this.#machine.options.length !== places.length) this.#machine.replaceChildren(...places.map((place) => html("option", { value: place, selected: place === chosen }, place)));
     if (!places.length) {
-      this.#message.textContent = "Nothing has been recorded yet.";
+      this.message.textContent = "Nothing has been recorded yet.";
       return;
     }
     const place = this.#machine.value;
@@ -70,7 +69,7 @@ class RecordingsView extends LiveElement {
     if (place !== this.#machine.value) return;
     this.#recordings = recordings;
     this.#alarms = alarms.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
-    this.#message.textContent = recordings.length === LATEST ? `The latest ${LATEST} recordings are shown.` : "";
+    this.message.textContent = recordings.length === LATEST ? `The latest ${LATEST} recordings are shown.` : "";
     const said = JSON.stringify([recordings, this.#alarms]);
     if (said === this.#said) return;
     this.#said = said;
@@ -89,7 +88,7 @@ class RecordingsView extends LiveElement {
   /** @param {string} why */
   refused(why) {
     this.#offer(this.#recordings.length > 0);
-    this.#message.textContent = why;
+    super.refused(why);
   }
 }
 

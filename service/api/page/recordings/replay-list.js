@@ -1,9 +1,7 @@
 import { clock } from "../monitor/figures.js";
-import { html, lay, renew, table } from "../elements/markup.js";
+import { html, renew, table } from "../elements/markup.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
-
-const REFRESH_S = 10;
 
 /** @import { ReplayJob } from "../monitor/records.d.ts" */
 
@@ -22,12 +20,12 @@ export function outcome(job) {
 
 /** Replays since the service started, the latest first. */
 class ReplayList extends LiveElement {
+  refreshS = 10;
   #said = "";
 
   connectedCallback() {
     super.connectedCallback();
     this.#said = "";
-    this.keepLoading(REFRESH_S);
   }
 
   async ask() {
@@ -47,11 +45,6 @@ class ReplayList extends LiveElement {
       ],
     }));
     renew(this, rows.length ? table(["started", "state", "how", "recordings", "with", "outcome"], rows, "Replays since the service started") : html("p", { class: "note" }, "Nothing has been replayed since the service started."));
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    lay(this, html("p", { class: "message", role: "status" }, why));
   }
 }
 

@@ -16,7 +16,7 @@ class ReplayView extends LiveElement {
   #head = html("div");
   #bar = /** @type {HTMLProgressElement} */ (html("progress", { max: 1, value: 0, "aria-label": "Progress of the replay" }));
   #state = html("p", { role: "status" });
-  #message = html("p", { class: "message", role: "alert" });
+  message = html("p", { class: "message", role: "alert" });
   #stop = html("button", { type: "button", hidden: true, click: () => this.#end() }, "Stop");
   #body = html("div");
   /** @type {EventSource | null} */
@@ -30,7 +30,7 @@ class ReplayView extends LiveElement {
 
   connectedCallback() {
     super.connectedCallback();
-    lay(this, this.#banner, html("div", { class: "replay-frame" }, this.#head, html("div", { class: "tools" }, this.#state, this.#bar, this.#stop), this.#message, this.#body));
+    lay(this, this.#banner, html("div", { class: "replay-frame" }, this.#head, html("div", { class: "tools" }, this.#state, this.#bar, this.#stop), this.message, this.#body));
     this.#sized.observe(this.#banner);
     this.load();
   }
@@ -82,11 +82,6 @@ class ReplayView extends LiveElement {
     } catch (error) {
       this.refused(error instanceof Error ? error.message : String(error));
     }
-  }
-
-  /** @param {string} why */
-  refused(why) {
-    this.#message.textContent = why;
   }
 }
 
