@@ -1,5 +1,6 @@
 /** Names and urgency of states, and the most critical reading of a machine. */
 import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figures.js";
+import { parameterReadings } from "../machine/parameter-readings.js";
 
 /** @import { Alarm, ChannelLevels, Health } from "./records.d.ts" */
 /** @typedef {Pick<import("./records.d.ts").LevelLimits, "measure" | "alert" | "danger" | "fall">} LevelLimits */
@@ -88,16 +89,10 @@ function levels(health) {
 
 /** @param {Health} health @returns {(Worst & {nearness: number})[]} */
 function parameters(health) {
-  const report = health.report;
-  const verdict = report?.verdict;
-  if (!report || !verdict) return [];
-  const current = new Map((verdict.settled ? report.parameters : verdict.current).map((one) => [one.name, one]));
-  return report.parameters.flatMap((stated) => {
-    const { name, text, relative_change: change = null, standard_error: error = null } = current.get(stated.name) ?? /** @type {Partial<import("./records.d.ts").Parameter>} */ ({});
-    if (change === null || error === null || !name) return [];
-    const seen = report.detectable.find((one) => one.name === name);
+  return parameterReadings(health).flatMap(({ read, parameter: { name, text, relative_change: change, standard_error: error }, seen }) => {
+    if (!read || change === null || error === null) return [];
     const least = seen && (change < 0 ? seen.loss : seen.gain);
-    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `detectable from ${percent(least)}` : "", quantity: "parameter", series: name, range: seen ? [seen.loss, seen.gain] : [], nearness: least ? change / least : 0 }];
+    return [{ title: text, value: within(change, Z95 * error), limit: least ? `detectable from ${percent(least)}` : "", quantity: "parameter", series: name, range: seen ? [seen.loss, seen.gain] : [], nearness: least ? change / least : 0 }];
   });
 }
 
