@@ -1,3 +1,4 @@
+import { confirmed } from "../elements/dialog.js";
 import { html, lay, renew, table } from "../elements/markup.js";
 import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
@@ -101,28 +102,9 @@ class TokenTable extends LiveElement {
   }
 
   /** @param {TokenEntry} token @param {boolean} own */
-  #revoke(token, own) {
-    const dialog = /** @type {HTMLDialogElement} */ (
-      html(
-        "dialog",
-        { "aria-labelledby": "revoke", close: () => this.#revoked(dialog, token) },
-        html(
-          "form",
-          { method: "dialog" },
-          html("h2", { id: "revoke" }, `Revoke the token of ${token.name}?`),
-          html("p", {}, own ? "It is the one you are signed in with: you will be signed out immediately." : "Its next request will be refused. This cannot be undone; a new token can be created."),
-          html("div", { class: "actions" }, html("button", { value: "do", class: "main" }, "Revoke"), html("button", { type: "button", click: () => dialog.close() }, "Cancel")),
-        ),
-      )
-    );
-    document.body.append(dialog);
-    dialog.showModal();
-  }
-
-  /** @param {HTMLDialogElement} dialog @param {TokenEntry} token */
-  async #revoked(dialog, token) {
-    dialog.remove();
-    if (dialog.returnValue !== "do") return;
+  async #revoke(token, own) {
+    const warning = own ? "It is the one you are signed in with: you will be signed out immediately." : "Its next request will be refused. This cannot be undone; a new token can be created.";
+    if (!(await confirmed(`Revoke the token of ${token.name}?`, "Revoke", html("p", {}, warning)))) return;
     try {
       await monitor.ask(`${TOKENS}/${token.token_id}`, { method: "DELETE" });
       this.message.textContent = `The token of ${token.name} is revoked.`;

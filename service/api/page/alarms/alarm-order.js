@@ -1,3 +1,4 @@
+import { confirmed } from "../elements/dialog.js";
 import { html } from "../elements/markup.js";
 
 const TITLES = /** @type {Record<string, string>} */ ({ shelve: "Shelve", "remove-from-service": "Take out of service" });
@@ -9,38 +10,23 @@ const HOURS = [1, 4, 8];
  * @param {string} about
  * @returns {Promise<Record<string, unknown> | null>} null if the operator cancels
  */
-export function ordered(kind, about) {
-  if (!(kind in TITLES)) return Promise.resolve({});
+export async function ordered(kind, about) {
+  if (!(kind in TITLES)) return {};
   const reason = /** @type {HTMLInputElement} */ (html("input", { required: true, maxlength: 500, pattern: ".*\\S.*", id: "reason", autocomplete: "off" }));
   const hours = /** @type {HTMLSelectElement} */ (html("select", { id: "hours" }, ...HOURS.map((each) => html("option", { value: each }, `${each} h`)), html("option", { value: "" }, "as long as the machine file allows")));
   const oneShot = /** @type {HTMLInputElement} */ (html("input", { type: "checkbox", id: "one-shot" }));
   const shelves = kind === "shelve";
-  const dialog = /** @type {HTMLDialogElement} */ (
-    html(
-      "dialog",
-      { "aria-labelledby": "order" },
-      html(
-        "form",
-        { method: "dialog" },
-        html("h2", { id: "order" }, TITLES[kind]),
-        html("p", {}, about),
-        html("label", { for: "reason" }, "Reason"),
-        reason,
-        shelves && html("label", { for: "hours" }, "For"),
-        shelves && hours,
-        shelves && html("label", { class: "check" }, oneShot, "until it clears, if that is earlier"),
-        html("div", { class: "actions" }, html("button", { value: "do", class: "main" }, TITLES[kind]), html("button", { type: "button", click: () => dialog.close() }, "Cancel")),
-      ),
-    )
+  const done = await confirmed(
+    TITLES[kind],
+    TITLES[kind],
+    html("p", {}, about),
+    html("label", { for: "reason" }, "Reason"),
+    reason,
+    shelves && html("label", { for: "hours" }, "For"),
+    shelves && hours,
+    shelves && html("label", { class: "check" }, oneShot, "until it clears, if that is earlier"),
   );
-  document.body.append(dialog);
-  dialog.showModal();
-  return new Promise((resolve) => {
-    dialog.addEventListener("close", () => {
-      dialog.remove();
-      if (dialog.returnValue !== "do") return resolve(null);
-      const time = shelves ? { one_shot: oneShot.checked, ...(hours.value ? { duration_s: 3600 * Number(hours.value) } : {}) } : {};
-      resolve({ reason: reason.value.trim(), ...time });
-    });
-  });
+  if (!done) return null;
+  const time = shelves ? { one_shot: oneShot.checked, ...(hours.value ? { duration_s: 3600 * Number(hours.value) } : {}) } : {};
+  return { reason: reason.value.trim(), ...time };
 }
