@@ -22,6 +22,7 @@ export class SamplePlot extends MachineElement {
   /** @type {Sensor[]} */
   sensors = [];
   body = html("div");
+  channel = choiceOf("Channel", () => this.load());
   message = html("p", { class: "note", role: "status" });
   #shown = "";
   /** @type {Map<string, HTMLElement>} */
@@ -60,7 +61,9 @@ export class SamplePlot extends MachineElement {
   }
 
   /** Offer channels or locations as soon as they are known. */
-  offer() {}
+  offer() {
+    offered(this.channel, this.sensors.map((one) => one.name));
+  }
 
   /** Arguments of the request. @returns {[string, string][]} */
   asked() {

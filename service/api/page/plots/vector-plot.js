@@ -14,21 +14,16 @@ class VectorPlot extends SamplePlot {
   route = "vectors";
   live = "windows of the history";
   refreshS = 60; // hundreds of reports are read
-  #channel = choiceOf("Channel", () => this.load());
   #order = choiceOf("Order", () => this.load());
 
   choices() {
     offered(this.#order, [["1", "1×"], ["2", "2×"]]);
-    return [this.#channel, this.#order];
-  }
-
-  offer() {
-    offered(this.#channel, this.sensors.map((one) => one.name));
+    return [this.channel, this.#order];
   }
 
   /** @returns {[string, string][]} */
   asked() {
-    return [["channel", this.#channel.value], ["order", this.#order.value]];
+    return [["channel", this.channel.value], ["order", this.#order.value]];
   }
 
   /** @param {Vectors} found */

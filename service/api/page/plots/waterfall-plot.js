@@ -12,21 +12,16 @@ const named = (row, over) => (over === "speed" ? `${(Math.abs(row.speed_rad_s ??
 /** Spectra of one channel over time or speed, as shades on a logarithmic scale. @extends {SamplePlot<Waterfall>} */
 class WaterfallPlot extends SamplePlot {
   route = "waterfalls";
-  #channel = choiceOf("Channel", () => this.load());
   #over = choiceOf("Over", () => this.load());
 
   choices() {
     offered(this.#over, [["time", "over time"], ["speed", "over speed"]]);
-    return [this.#channel, this.#over];
-  }
-
-  offer() {
-    offered(this.#channel, this.sensors.map((one) => one.name));
+    return [this.channel, this.#over];
   }
 
   /** @returns {[string, string][]} */
   asked() {
-    return [["channel", this.#channel.value], ["over", this.#over.value]];
+    return [["channel", this.channel.value], ["over", this.#over.value]];
   }
 
   /** @param {Waterfall} found */
