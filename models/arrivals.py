@@ -55,8 +55,6 @@ class Arrivals:
     """
 
     def __init__(self, bound: int) -> None:
-        if bound < 0:
-            raise ValueError(f"bound is {bound}, expected 0 or more")
         self._bound = bound
         self._run: int | None = None
         self._next = 0

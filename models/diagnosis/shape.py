@@ -92,14 +92,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         """Compare every channel of a window with its healthy shape, or say why it cannot be compared.
 
         The rate is the declared probability that any channel of an unchanged machine is called changed in one window.
-
-        Raises
-        ------
-        ValueError
-            If the rate is not between 0 and 1.
         """
-        if not 0 < rate < 1:
-            raise ValueError(f"rate is {rate}, expected between 0 and 1")
         window, own_rate = window.as_mounted, self._own_rate(rate)
         common = self._not_comparable(window)
         return tuple(self._judged(one, window, common, own_rate) for one in self.channels)

@@ -151,7 +151,7 @@ class MachineStore:
             *([] if after is None else [log.sequence > after]),
             *_between(log.sequence, None, before),
         )
-        query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
+        query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(limit)
         return tuple(StoredEvent(*row) for row in self.database.rows(query))
 
     def reports(
@@ -166,7 +166,7 @@ class MachineStore:
         with self.database.reading() as connection:
             chosen = self._windows(connection, report, since_ns, until_ns)
             query = query.where(*chosen, *_between(report.number, None, before)).order_by(report.number.desc())
-            rows = connection.execute(query.limit(_checked(limit))).all()
+            rows = connection.execute(query.limit(limit)).all()
         return tuple((row.number, StoredReport(*row[1:-1], unpack(row.text))) for row in rows)
 
     def readings(
@@ -186,7 +186,7 @@ class MachineStore:
         window, of, found = windows.c, series.c, list[Reading]()
         named = (of.machine_id == self.claim.machine_id, of.quantity == quantity, of.name == name)
         query = select(window.number, window.end_ns, window.readings).order_by(window.number)
-        query = query.execution_options(yield_per=min(_checked(limit), _AT_ONCE))
+        query = query.execution_options(yield_per=min(limit, _AT_ONCE))
         with self.database.reading() as connection:
             series_id = connection.scalar(select(of.series_id).where(*named))
             chosen = self._windows(connection, window, since_ns, until_ns)
@@ -235,7 +235,7 @@ class MachineStore:
         """
         with self.database.reading() as connection:
             of = connection, self.claim.machine_id, self._writer.bucket_ns
-            return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
+            return trend(*of, quantity, names, since_ns, until_ns, points)
 
     def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[StoredBucket, ...]:
         """Readings of one name in the last `span_ns` up to the newest window, reduced like those of `downsampled`."""
@@ -245,7 +245,7 @@ class MachineStore:
             end_ns = connection.scalar(newest.order_by(window.end_ns.desc()).limit(1))
             of = connection, self.claim.machine_id, self._writer.bucket_ns
             since_ns = max(0, (end_ns or 0) - span_ns)
-            return trend(*of, quantity, [name], since_ns, None, _checked(points))
+            return trend(*of, quantity, [name], since_ns, None, points)
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
         """The last sequence after these events; raises `StoreError` at a gap or a repeated id."""
@@ -277,9 +277,3 @@ class MachineStore:
 def _between(column: ColumnElement[int], first: int | None, end: int | None) -> list[ColumnElement[bool]]:
     since = [] if first is None else [column >= first]
     return since if end is None else [*since, column < end]
-
-
-def _checked(limit: int) -> int:
-    if limit < 1:
-        raise StoreError(f"history: {limit} entries were asked for, expected 1 or more")
-    return limit

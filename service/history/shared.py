@@ -99,8 +99,6 @@ class AuditLog:
 
         Only those about this ``site/name``, and by this actor, if given.
         """
-        if limit < 1:
-            raise StoreError(f"audit log: {limit} entries were asked for, expected 1 or more")
         query = select(*_ENTRY).order_by(audit_log.c.number.desc()).limit(limit)
         if before is not None:
             query = query.where(audit_log.c.number < before)
@@ -119,15 +117,7 @@ class TokenStore:
         self._database = database
 
     def add(self, record: TokenRecord) -> None:
-        """Keep a new token.
-
-        Raises
-        ------
-        StoreError
-            If a scope holds a blank, or there is a token with this identifier.
-        """
-        if any(not scope or scope.split() != [scope] for scope in record.scopes):
-            raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
+        """Keep a new token; raises `StoreError` too if there is one with this identifier."""
         values = asdict(record) | {"scopes": " ".join(record.scopes)}
         with self._database.writing() as connection:
             there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)

@@ -94,6 +94,15 @@ def test_default_lags_are_close_enough_for_every_rate_that_allows_it(tmp_path: P
         assert machine.window.lag_step_s <= longest_s or longest_s * rate_hz < 1
 
 
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [("ingest.reorder_blocks = -1", "expected 0 to 1000"), ("alarms.false_alarms_per_month = 0", "expected above 0")],
+)
+def test_bounds_that_no_computation_checks_again(tmp_path: Path, table: str, text: str) -> None:
+    with pytest.raises(MachineFileError, match=text):
+        load_machine_file(write(tmp_path, f"{table}\n{SENSORS_ALONE}"))
+
+
 def test_a_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     assert load_machine_file(write(tmp_path, "\ufeff" + SENSORS_ALONE)).name == "fan"
 

@@ -247,8 +247,3 @@ def test_arrivals_resume_at_the_block_that_a_restored_gate_expects() -> None:
     assert [arrived.sequence for arrived in arrivals.take(block(7))] == [7, 8]
     arrivals.resume(())
     assert [arrived.sequence for arrived in arrivals.take(block(100))] == [100]
-
-
-def test_a_negative_bound_is_refused() -> None:
-    with pytest.raises(ValueError, match="bound is -1, expected 0 or more"):
-        Arrivals(-1)

@@ -37,15 +37,7 @@ def _rate_per_test(probability: float, tests: int) -> float:
 
 
 def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
-    """Thresholds of one window by itself; `rate` is the probability, over all parameters, of a false alarm in it.
-
-    Raises
-    ------
-    ValueError
-        If the rate is not between 0 and 1, or there is no parameter.
-    """
-    if not 0 < rate < 1 or n_parameters < 1:
-        raise ValueError(f"rate is {rate} for {n_parameters} parameters, expected 0 < rate < 1 and at least one")
+    """Thresholds of one window by itself; `rate` is the probability, over all parameters, of a false alarm in it."""
     others = max(1, n_parameters - 1)
     return Thresholds(
         first=_upper_quantile(_rate_per_test(rate, n_parameters) / 2),
@@ -88,17 +80,7 @@ def month_thresholds(
 
     The machine is to have `per_month` false alarms in 30 days of data. If windows of `n_stretches` different lengths
     are tested side by side, each gets an equal share of that rate.
-
-    Raises
-    ------
-    ValueError
-        If a number is not positive.
     """
-    if min(per_month, hop_s) <= 0 or min(overlap, n_parameters, n_stretches) < 1:
-        raise ValueError(
-            f"{per_month} per month, hop {hop_s} s, {overlap} hops, {n_parameters} parameters, {n_stretches} stretches:"
-            " expected positive numbers"
-        )
     per_hop = per_month * hop_s / MONTH_S / n_stretches
     others = max(1, n_parameters - 1)
     return Thresholds(
@@ -228,13 +210,5 @@ def detectable_changes(stretch: Stretch, thresholds: Thresholds, length_s: float
 
 
 def length_to_find(found: Detectable, change: float) -> float:
-    """Length of data, s, that finds another change of the parameter: errors fall with the square root of the length.
-
-    Raises
-    ------
-    ValueError
-        If the change is 0 or -1 and below.
-    """
-    if change == 0 or not change > -1:
-        raise ValueError(f"change of {found.name} to be found is {change}, expected above -1 and not 0")
+    """Length of data, s, that finds another change of the parameter: errors fall with the square root of the length."""
     return found.length_s * (to_scale(found.name, found.gain) / to_scale(found.name, change)) ** 2

@@ -14,7 +14,6 @@ from rotorwatch.records.snapshots import Units
 
 MOST_PAIRS = 8
 """Most pairs in a snapshot if none is requested."""
-_MOST_CHANNELS = 64
 _DIGITS = 6
 _Array = TypeVar("_Array", FloatArray, ComplexArray)
 
@@ -29,11 +28,9 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
     Raises
     ------
     SnapshotError
-        If a channel does not exist or is the shaft angle, or there are too many names.
+        If a channel does not exist or is the shaft angle.
     """
     there = {channel.name: channel for channel in machine.sensors if state_name(channel) != "theta"}
-    if len(names) > _MOST_CHANNELS:
-        raise SnapshotError(f"{machine.title}: {len(names)} values of {field}, expected at most {_MOST_CHANNELS}")
     for name in names:
         if name not in there:
             known = {channel.name for channel in machine.sensors}

@@ -15,10 +15,9 @@ from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSample
 from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, Prediction, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
-from service.analysis.snapshots.channels import SnapshotError, figures, known_figures
+from service.analysis.snapshots.channels import figures, known_figures
 from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
 
-MOST_REVOLUTIONS = 64
 _MOST_SAMPLES = 20_000
 _NO_SPEED = "the speed of rotation is not known"
 
@@ -35,10 +34,7 @@ class _Vectors:
 
 
 def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions.
-
-    Raises SnapshotError if these are negative or too many.
-    """
+    """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions."""
     machine, known, window = subject.machine, subject.known, data.window
     there = orbit_pairs(machine.sensors)
     pairs = [pair for pair in there if not data.lost & {state_name(one) for one in pair}]
@@ -166,8 +162,6 @@ def _ellipse(q: ComplexArray, vectors: _Vectors) -> OrbitEllipse:
 def _newest_path(
     machine: MachineFile, blocks: tuple[SampleBlock, ...], revolutions: int, speed_rad_s: float | None
 ) -> Revolutions:
-    if not 0 <= revolutions <= MOST_REVOLUTIONS:
-        raise SnapshotError(f"{machine.title}: revolutions is {revolutions}, expected 0 to {MOST_REVOLUTIONS}")
     if not revolutions:
         return Revolutions("none were asked for")
     if not blocks:

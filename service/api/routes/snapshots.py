@@ -30,12 +30,12 @@ from service.analysis.recorded import Sampled
 from service.analysis.snapshots import plots
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels
 from service.analysis.snapshots.machine import LatestData
-from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, InPath, SinceNs, UntilNs
 from service.stream.monitored import Monitored
 
 _MOST = 64
+_MOST_REVOLUTIONS = 64
 _SAMPLES_HOLD_S = 1.0
 _MOST_REPORTS = 400
 _SOON_S = 120.0
@@ -51,7 +51,7 @@ _Second = Annotated[
 _Channels = Annotated[list[str], Query(alias="channel", max_length=64, description="name; may be repeated")]
 _Units = Annotated[Units, Query(description="units of the values, the channels' own or SI")]
 _Revolutions = Annotated[
-    int, Query(ge=0, le=MOST_REVOLUTIONS, description="newest revolutions to show sample by sample as well")
+    int, Query(ge=0, le=_MOST_REVOLUTIONS, description="newest revolutions to show sample by sample as well")
 ]
 _Shown = Annotated[
     list[str], Query(alias="channel", max_length=64, description="name; may be repeated; all displacements if left out")
@@ -199,7 +199,7 @@ def add_plot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> None:
         view: InPath,
         chosen: ChosenWindow,
         channel: _Shown = _NONE,
-        revolutions: Annotated[int, Query(ge=1, le=MOST_REVOLUTIONS, description="newest revolutions to show")] = 8,
+        revolutions: Annotated[int, Query(ge=1, le=_MOST_REVOLUTIONS, description="newest revolutions to show")] = 8,
     ) -> WaveformSnapshot:
         """The newest revolutions of channels, sample by sample, with the phase reference's pulses."""
         names = [one.name for one in chosen_channels(view.machine, channel)]

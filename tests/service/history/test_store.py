@@ -269,9 +269,6 @@ def test_audit_entries_are_numbered_paged_and_filtered(store: Store) -> None:
     assert (store.audit.entries(limit=3), store.audit.entries(found[2].number, 2)) == (found[:3], found[3:5])
     assert {entry.machine for entry in store.audit.entries(machine="demo/m1")} == {"demo/m1"}
     assert {entry.actor for entry in store.audit.entries(actor="actor 0")} == {"actor 0"}
-    for asked_for in (lambda: store.audit.entries(limit=0), lambda: store.machine("demo", "lab").events(limit=0)):
-        with pytest.raises(StoreError, match="0 entries were asked for"):
-            asked_for()
 
 
 def test_tokens_are_revoked_once_and_webhook_cursors_are_kept(store: Store) -> None:
@@ -283,8 +280,6 @@ def test_tokens_are_revoked_once_and_webhook_cursors_are_kept(store: Store) -> N
     assert store.tokens.find("cccc") is None
     with pytest.raises(StoreError, match="aaaa: there is one with this identifier already"):
         store.tokens.add(first)
-    with pytest.raises(StoreError, match="expected words without blanks"):
-        store.tokens.add(TokenRecord("dddd", "bad", ("read operate",), b"", T0, None, None))
     assert store.tokens.revoke("aaaa", T0 + 9) is True
     assert store.tokens.revoke("aaaa", T0 + 10) is False
     assert store.tokens.revoke("cccc", T0) is False
