@@ -82,12 +82,13 @@ class EvidenceCollector:
         return kept if kept.settled is None else None
 
     def _picture(self, report: Report) -> Picture:
-        latest, snapshots = self._worker.latest, self._worker.snapshots
+        from service.analysis.snapshots.orbit import orbit_snapshot  # noqa: PLC0415  # needed for few windows
+        from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot  # noqa: PLC0415
+
+        seen = self._worker.snapshots, self._worker.latest
+        correlations = _measured(correlation_snapshot(*seen))
         return Picture(
-            report=report,
-            spectra=snapshots.spectra(latest),
-            orbits=snapshots.orbits(latest),
-            correlations=_measured(snapshots.correlations(latest)),
+            report=report, spectra=spectrum_snapshot(*seen), orbits=orbit_snapshot(*seen), correlations=correlations
         )
 
 

@@ -1,10 +1,9 @@
-"""Makes the snapshots of one machine: their common parts, and the theory of the latest window, which is cached.
+"""What the snapshots of one machine have in common, and the theory of the latest window, which is cached.
 
 The modules that compute snapshots are imported at the first request, so a process that only evaluates does without.
 """
 
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -19,14 +18,7 @@ from models.machine import Machine, MachineFile
 from models.signals.block import SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.sensor_faults import FaultKind
-from rotorwatch.records.snapshots import (
-    CorrelationSnapshot,
-    OrbitSnapshot,
-    PredictedChange,
-    SpectrumSnapshot,
-    Theory,
-    Units,
-)
+from rotorwatch.records.snapshots import PredictedChange, Theory
 from rotorwatch.records.windows import Parameter, SensorFault
 from service.monitor.reports import Identity
 
@@ -34,15 +26,6 @@ if TYPE_CHECKING:
     from service.analysis.prediction import Prediction
 
 _NO_WINDOW = "there is no window yet"
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """The machine that a snapshot is of."""
-
-    identity: Identity
-    machine: MachineFile
-    known: Machine | None  # the machine with all its parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +61,13 @@ class LatestData:
         return None if self.window is None else self.window.end_ns, self.parameters, self.filled, self.why_not
 
 
-def heading(subject: Subject, data: LatestData, prediction: "Prediction") -> dict[str, Any]:
+def heading(identity: Identity, data: LatestData, prediction: "Prediction") -> dict[str, Any]:
     """Fields of every snapshot: the machine, its window and speed, and the parameter changes that theory assumes."""
     window = data.window
     speed = np.nan if window is None or "theta" in data.lost else window.speed_rad_s
     shown = {} if prediction.estimated_reason else prediction.changes
     return {
-        **subject.identity,
+        **identity,
         "start_ns": None if window is None else window.start_ns,
         "end_ns": None if window is None else window.end_ns,
         "filled": data.filled,
@@ -116,55 +99,29 @@ def no_window(machine: MachineFile, data: LatestData) -> str:
 
 
 class MachineSnapshots:
-    """Makes snapshots of one machine; thread-safe.
+    """The machine that snapshots are of; thread-safe.
 
     The theory of a window takes longest to compute, so it is cached for as long as the window exists.
     """
 
     def __init__(self, installed: Installed, identity: Identity) -> None:
         self.installed = installed
-        self._subject = Subject(identity, installed.machine, installed.known)
+        self.identity = identity
+        self.machine: MachineFile = installed.machine
+        self.known: Machine | None = installed.known  # the machine with all its parameters
         self._lock = threading.Lock()
         self._predictions: WeakKeyDictionary[WindowStatistics, Prediction] = WeakKeyDictionary()
 
-    def correlations(
-        self, data: LatestData, first: Sequence[str] = (), second: Sequence[str] = (), units: Units = "channel"
-    ) -> CorrelationSnapshot:
-        """Correlation functions of the latest window, see `correlation_snapshot`."""
-        from service.analysis.snapshots.window import correlation_snapshot  # noqa: PLC0415
-
-        return correlation_snapshot(self._subject, data, self._theory(data), first, second, units)
-
-    def spectra(
-        self,
-        data: LatestData,
-        channels: Sequence[str] = (),
-        first: Sequence[str] = (),
-        second: Sequence[str] = (),
-        band_hz: tuple[float, float] | None = None,
-        units: Units = "channel",
-    ) -> SpectrumSnapshot:
-        """Power spectral densities of the latest window, see `spectrum_snapshot`."""
-        from service.analysis.snapshots.window import spectrum_snapshot  # noqa: PLC0415
-
-        return spectrum_snapshot(self._subject, data, self._theory(data), channels, first, second, band_hz, units)
-
-    def orbits(self, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-        """Orbits of the latest window and the newest revolutions, see `orbit_snapshot`."""
-        from service.analysis.snapshots.orbit import orbit_snapshot  # noqa: PLC0415
-
-        return orbit_snapshot(self._subject, data, revolutions, units)
-
-    def _theory(self, data: LatestData) -> "Prediction":
+    def theory(self, data: LatestData) -> "Prediction":
+        """Theory for the window of the data; without a window, or without all its signals, why there is none."""
         from service.analysis.prediction import NO_PARAMETERS, Prediction, predict  # noqa: PLC0415
 
         if data.window is None or data.lost & {*data.window.states, "theta"}:
-            known = self._subject.known
-            reason = NO_PARAMETERS if known is None else unsent(self._subject.machine, data) or _NO_WINDOW
-            return Prediction(known, None, {}, reason, reason)
+            reason = NO_PARAMETERS if self.known is None else unsent(self.machine, data) or _NO_WINDOW
+            return Prediction(self.known, None, {}, reason, reason)
         with self._lock:
             found = self._predictions.get(data.window)
             if found is None:
-                found = predict(self._subject.known, data.window, data.parameters, data.why_not)
+                found = predict(self.known, data.window, data.parameters, data.why_not)
                 self._predictions[data.window] = found
             return found

@@ -16,7 +16,7 @@ from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phas
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, Prediction, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions
 from service.analysis.snapshots.channels import figures, known_figures
-from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots, heading, no_window, unsent
 
 _MOST_SAMPLES = 20_000
 _NO_SPEED = "the speed of rotation is not known"
@@ -33,9 +33,11 @@ class _Vectors:
     absolute: bool
 
 
-def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
+def orbit_snapshot(
+    of: MachineSnapshots, data: LatestData, revolutions: int = 0, units: Units = "channel"
+) -> OrbitSnapshot:
     """Orbits at every location with displacements in both directions; paths over `revolutions` whole revolutions."""
-    machine, known, window = subject.machine, subject.known, data.window
+    machine, known, window = of.machine, of.known, data.window
     there = orbit_pairs(machine.sensors)
     pairs = [pair for pair in there if not data.lost & {state_name(one) for one in pair}]
     places = [pair for pair in pairs if pair[0].location in MODELLED]
@@ -60,7 +62,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         predicted[1] = None if estimated_reason else _predicted(known, changed(known.rotor, changes), window)
     others = [(pair, _path(machine, path, pair, units)) for pair in pairs if pair not in places]
     return OrbitSnapshot(
-        **heading(subject, data, Prediction(known, None, changes, lacking, estimated_reason)),
+        **heading(of.identity, data, Prediction(known, None, changes, lacking, estimated_reason)),
         speed_source="unknown" if window is None else window.speed_source,
         orbits=tuple(
             _window_orbit(pair, window, vectors, predicted, _path(machine, path, pair, units), units) for pair in places

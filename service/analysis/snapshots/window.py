@@ -29,7 +29,7 @@ from service.analysis.snapshots.channels import (
     product_unit,
     seen_by,
 )
-from service.analysis.snapshots.machine import LatestData, Subject, heading, no_window, unsent
+from service.analysis.snapshots.machine import LatestData, MachineSnapshots, heading, no_window, unsent
 
 _MOST_LINES = 1000
 """Most lines in a snapshot; if the band has more, adjacent lines are averaged."""
@@ -42,17 +42,17 @@ _Spectra = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
 
 
 def correlation_snapshot(
-    subject: Subject,
+    of: MachineSnapshots,
     data: LatestData,
-    prediction: Prediction,
-    first: Sequence[str],
-    second: Sequence[str],
-    units: Units,
+    first: Sequence[str] = (),
+    second: Sequence[str] = (),
+    units: Units = "channel",
 ) -> CorrelationSnapshot:
     """Correlation functions of pairs of channels, see `chosen_pairs`, with standard errors and predictions."""
-    machine, window = subject.machine, None if data.window is None else data.window.as_mounted
+    machine, window = of.machine, None if data.window is None else data.window.as_mounted
     pairs = chosen_pairs(machine, first, second)
-    head = heading(subject, data, prediction)
+    prediction = of.theory(data)
+    head = heading(of.identity, data, prediction)
     if window is not None and not (first or second):
         pairs = tuple(pair for pair in pairs if all(state_name(one) in window.states for one in pair))
     if window is None or not pairs:
@@ -129,25 +129,25 @@ def _rms_z(difference: FloatArray, errors: FloatArray) -> float | None:
     return figures([np.sqrt(np.mean((difference / errors) ** 2))])[0]
 
 
-def spectrum_snapshot(  # noqa: PLR0913  # options of the request
-    subject: Subject,
+def spectrum_snapshot(
+    of: MachineSnapshots,
     data: LatestData,
-    prediction: Prediction,
-    channels: Sequence[str],
-    first: Sequence[str],
-    second: Sequence[str],
-    band_hz: tuple[float, float] | None,
-    units: Units,
+    channels: Sequence[str] = (),
+    first: Sequence[str] = (),
+    second: Sequence[str] = (),
+    band_hz: tuple[float, float] | None = None,
+    units: Units = "channel",
 ) -> SpectrumSnapshot:
     """Power spectral densities of channels, see `chosen_channels`, and cross-spectra and coherence of named pairs.
 
     The band is limited to that of the machine file; SnapshotError if it holds too few lines.
     """
-    machine, window = subject.machine, None if data.window is None else data.window.as_mounted
+    machine, window = of.machine, None if data.window is None else data.window.as_mounted
     chosen = chosen_channels(machine, channels)
     pairs = chosen_pairs(machine, first, second) if first or second else ()
     within = _checked(machine, band_hz)
-    head = heading(subject, data, prediction)
+    prediction = of.theory(data)
+    head = heading(of.identity, data, prediction)
     if window is not None and not channels:
         chosen = tuple(channel for channel in chosen if state_name(channel) in window.states)
     used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))

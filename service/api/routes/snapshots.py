@@ -30,6 +30,8 @@ from service.analysis.recorded import Sampled
 from service.analysis.snapshots import plots
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels
 from service.analysis.snapshots.machine import LatestData
+from service.analysis.snapshots.orbit import orbit_snapshot
+from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot
 from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, InPath, SinceNs, UntilNs
 from service.stream.monitored import Monitored
@@ -128,7 +130,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
         """Correlation functions of the latest or a recorded window, with theory; a few pairs by default."""
         shown, data = reader.window(view, chosen)
         asked = ("correlations", view, chosen, tuple(first), tuple(second), units)
-        return answers.of(asked, data, lambda: shown.correlations(data, first, second, units))
+        return answers.of(asked, data, lambda: correlation_snapshot(shown, data, first, second, units))
 
     @app.get(f"{PLACE}/spectra", **written(SpectrumSnapshot, 404, 422), **common)
     def spectra(
@@ -147,7 +149,7 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
         shown, data = reader.window(view, chosen)
         asked = ("spectra", view, chosen, tuple(channel), tuple(first), tuple(second), band, units)
-        return answers.of(asked, data, lambda: shown.spectra(data, channel, first, second, band, units))
+        return answers.of(asked, data, lambda: spectrum_snapshot(shown, data, channel, first, second, band, units))
 
     @app.get(f"{PLACE}/orbits", **written(OrbitSnapshot, 404, 422), **common)
     def orbits(
@@ -156,7 +158,9 @@ def add_snapshot_routes(app: FastAPI, reader: SampleReader, guard: Guard) -> Non
         """Orbits at running speed of the latest or a recorded window, and revolutions as measured."""
         shown, data = reader.window(view, chosen)
         asked = ("orbits", view, chosen, revolutions, units)
-        return answers.of(asked, data, lambda: shown.orbits(data, revolutions, units), of_samples=revolutions > 0)
+        return answers.of(
+            asked, data, lambda: orbit_snapshot(shown, data, revolutions, units), of_samples=revolutions > 0
+        )
 
 
 def _made(

@@ -14,6 +14,8 @@ from rotorwatch.records.health import HealthState
 from service.analysis.orbit import orbit_pairs, orbits_of
 from service.analysis.revolutions import Excerpt
 from service.analysis.snapshots.machine import LatestData
+from service.analysis.snapshots.orbit import orbit_snapshot
+from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot
 from service.commands.installation import init
 from service.monitor.conversion import machine_description
 from service.monitor.descriptor import descriptor_mismatch
@@ -43,8 +45,8 @@ def samples(of: tuple[SampleBlock, ...]) -> np.ndarray:
 
 
 def test_orbits_are_turned_to_y_and_z_and_labelled_so() -> None:
-    plain = snapshots_of(LAB).orbits(held(mounted=False), 4)
-    turned = snapshots_of(TURNED).orbits(held(mounted=True), 4)
+    plain = orbit_snapshot(snapshots_of(LAB), held(mounted=False), 4)
+    turned = orbit_snapshot(snapshots_of(TURNED), held(mounted=True), 4)
     assert [orbit.location for orbit in turned.orbits] == ["bearing", "disc"]
     for one, other in zip(plain.orbits, turned.orbits, strict=True):
         for name in ("ellipse", "nominal", "estimated"):
@@ -62,7 +64,7 @@ def test_orbits_are_turned_to_y_and_z_and_labelled_so() -> None:
 
 def test_spectra_correlations_and_theory_are_those_of_the_probes() -> None:
     data = held(mounted=True)
-    spectrum = snapshots_of(TURNED).spectra(data, ["y1", "z2", "y2_dot"], ["y1"], ["y1_dot"])
+    spectrum = spectrum_snapshot(snapshots_of(TURNED), data, ["y1", "z2", "y2_dot"], ["y1"], ["y1_dot"])
     mounted = sure(data.window).as_mounted
     for density in spectrum.densities:
         column = {"y1": "bearing@45", "z2": "disc@160", "y2_dot": "y2_dot"}[density.channel]
@@ -75,17 +77,17 @@ def test_spectra_correlations_and_theory_are_those_of_the_probes() -> None:
     (cross,) = spectrum.cross
     assert numbers(cross.nominal_magnitude) == pytest.approx(numbers(cross.magnitude), rel=5)
     assert (cross.first, cross.second) == ("y1", "y1_dot")
-    found = snapshots_of(TURNED).correlations(data, ["y1", "y1"], ["y1", "z2"])
+    found = correlation_snapshot(snapshots_of(TURNED), data, ["y1", "y1"], ["y1", "z2"])
     for pair in found.pairs:
         assert sure(pair.nominal_z) < 4
 
 
 def test_the_spectrum_of_a_probe_is_that_of_the_planes_at_its_angle() -> None:
     plain, turned = (
-        snapshots_of(machine).spectra(held(mounted=mounted), ["y1"], ["y1"], ["z1"])
+        spectrum_snapshot(snapshots_of(machine), held(mounted=mounted), ["y1"], ["y1"], ["z1"])
         for machine, mounted in ((LAB, False), (TURNED, True))
     )
-    z = snapshots_of(LAB).spectra(held(mounted=False), ["z1"]).densities[0]
+    z = spectrum_snapshot(snapshots_of(LAB), held(mounted=False), ["z1"]).densities[0]
     cross = plain.cross[0]
     real = numbers(cross.magnitude) * np.cos(np.radians(numbers(cross.phase_deg)))
     expected = (numbers(plain.densities[0].measured) + numbers(z.measured)) / 2 + real

@@ -5,6 +5,8 @@ import pytest
 
 from models.machine import Machine
 from service.analysis.snapshots.machine import LatestData
+from service.analysis.snapshots.orbit import orbit_snapshot
+from service.analysis.snapshots.window import correlation_snapshot
 from tests.commissioning.rotor_kit import LAB, NOTHING, elsewhere, stream
 from tests.service.analysis.snapshotting import (
     SECONDS,
@@ -22,7 +24,7 @@ from tests.sure import sure
 
 def test_the_orbit_of_a_known_unbalance_follows_the_equations_of_motion() -> None:
     data = LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:])
-    snapshot = snapshots_of(LAB).orbits(data, 8)
+    snapshot = orbit_snapshot(snapshots_of(LAB), data, 8)
     assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
     assert snapshot.speed_source == "phase reference"
     W, q_um = LAB.operation.speed_rad_s, unbalance_um()
@@ -61,7 +63,7 @@ def test_stated_errors_of_an_orbit_are_the_scatter_of_hops() -> None:
     """Scatter of twelve healthy hops against the stated errors; the estimated orbit has the nominal size."""
     data = latest()
     assert data.window is not None
-    snapshot = snapshots_of(LAB).orbits(data)
+    snapshot = orbit_snapshot(snapshots_of(LAB), data)
     for orbit in snapshot.orbits:
         assert orbit.estimated is not None
         for vector in (orbit.y, orbit.z):
@@ -89,7 +91,7 @@ def test_a_backward_orbit_of_a_shaft_that_turns_the_other_way() -> None:
     channels["z1"] = channels["z1"].model_copy(update={"unit": "mil"})
     machine = NOTHING.model_copy(update={"sensors": tuple(channels.values())})
     data = LatestData(window_of(machine, stream_), 1.0, (), "", tuple(stream_[-10:]))
-    snapshot = snapshots_of(machine).orbits(data, 3)
+    snapshot = orbit_snapshot(snapshots_of(machine), data, 3)
     assert snapshot.speed_rad_s == pytest.approx(-2 * np.pi * 25, rel=1e-3)
     orbit = snapshot.orbits[0]
     assert orbit.ellipse is not None
@@ -104,7 +106,7 @@ def test_a_backward_orbit_of_a_shaft_that_turns_the_other_way() -> None:
 def test_without_a_phase_reference_orbits_keep_size_and_sense() -> None:
     machine = Machine.model_validate(LAB.model_dump() | {"sensors": [c for c in LAB.sensors if c.name != "theta"]})
     data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", stream(SECONDS, SEED)[-20:])
-    blind, seeing = snapshots_of(machine).orbits(data, 4), snapshots_of(LAB).orbits(latest())
+    blind, seeing = orbit_snapshot(snapshots_of(machine), data, 4), orbit_snapshot(snapshots_of(LAB), latest())
     assert blind.speed_source == "estimated"
     assert blind.speed_rad_s == pytest.approx(LAB.operation.speed_rad_s, rel=1e-3)
     for one, other in zip(blind.orbits, seeing.orbits, strict=True):
@@ -117,7 +119,7 @@ def test_without_a_phase_reference_orbits_keep_size_and_sense() -> None:
         assert sure(one.path).times_s[-1] == pytest.approx(turns_s, abs=2 / LAB.rate_hz)
     assert (blind.revolutions, blind.pulses_s) == (4, ())
     assert blind.path_reason.startswith("the shaft angle is not measured")
-    snapshot = snapshots_of(machine).correlations(data)
+    snapshot = correlation_snapshot(snapshots_of(machine), data)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
 
 
@@ -125,8 +127,10 @@ def test_places_outside_the_model_have_orbits_of_the_newest_revolutions() -> Non
     data = LatestData(None, 0.0, (), "not asked", quiet()[-20:])
     casing = elsewhere(LAB)
     moved = [one.model_copy(update={"location": "NDE"}) if one.name in {"y2", "z2"} else one for one in casing.sensors]
-    snapshot = snapshots_of(casing.model_copy(update={"sensors": tuple(moved)})).orbits(data, 8)
-    there = snapshots_of(LAB).orbits(LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:]), 8)
+    snapshot = orbit_snapshot(snapshots_of(casing.model_copy(update={"sensors": tuple(moved)})), data, 8)
+    there = orbit_snapshot(
+        snapshots_of(LAB), LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:]), 8
+    )
     assert [one.location for one in snapshot.orbits] == ["casing", "NDE"]
     assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
     for found, known in zip(snapshot.orbits, there.orbits, strict=True):
@@ -135,4 +139,4 @@ def test_places_outside_the_model_have_orbits_of_the_newest_revolutions() -> Non
         assert ellipse.semi_major == pytest.approx(expected.semi_major, rel=0.01)
         assert ellipse.semi_minor == pytest.approx(expected.semi_minor, rel=0.01)
         assert (ellipse.sense, ellipse.precession) == ("y to z", "forward")
-    assert not snapshots_of(casing).orbits(data).orbits  # without samples there is nothing to be shown
+    assert not orbit_snapshot(snapshots_of(casing), data).orbits  # without samples there is nothing to be shown

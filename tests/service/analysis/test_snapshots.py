@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.analysis.prediction import Prediction, predict
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.machine import LatestData
+from service.analysis.snapshots.orbit import orbit_snapshot
+from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot
 from service.api.routes.snapshots import WindowAnswers
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
@@ -41,7 +44,7 @@ from tests.sure import sure
 
 @pytest.mark.parametrize("lagged", [True, False])
 def test_nominal_theory_fits_a_healthy_machine_and_not_a_faulty_one(lagged: bool) -> None:
-    snapshot = snapshots_of(LAB).correlations(latest(lagged=lagged))
+    snapshot = correlation_snapshot(snapshots_of(LAB), latest(lagged=lagged))
     assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", "", "")
     assert snapshot.method == ("samples" if lagged else "spectrum")
     assert len(snapshot.lags_s) == 126
@@ -56,7 +59,7 @@ def test_nominal_theory_fits_a_healthy_machine_and_not_a_faulty_one(lagged: bool
         z = (numbers(pair.measured) - numbers(pair.nominal)) / numbers(pair.standard_error)
         assert np.abs(z).max() < 5
         assert np.sqrt(np.mean(z**2)) == pytest.approx(pair.nominal_z, rel=1e-3)
-    snapshot = snapshots_of(LAB).correlations(latest(K_BY, lagged=lagged))
+    snapshot = correlation_snapshot(snapshots_of(LAB), latest(K_BY, lagged=lagged))
     changes = {change.name: change.relative_change for change in snapshot.theory.changes}
     assert changes["k_by"] == pytest.approx(-0.3, abs=0.02)
     for pair in by_plane(snapshot, "y"):
@@ -77,7 +80,7 @@ def test_predicted_correlations_solve_the_lyapunov_equation(faults: tuple[Event,
     covariance = stationary_covariance(A, expanded_B(sources))
     names = [channel.name for channel in LAB.sensors if channel.name != "theta"]
     first, second = (list(column) for column in zip(*[(one, other) for one in names for other in names], strict=True))
-    snapshot = snapshots_of(LAB).correlations(data, first, second, units="SI")
+    snapshot = correlation_snapshot(snapshots_of(LAB), data, first, second, units="SI")
     row = {channel.name: STATE_INDEX[state_name(channel)] for channel in LAB.sensors if channel.name != "theta"}
     exact = np.stack([correlation(A, covariance, lag_s) for lag_s in snapshot.lags_s])
     rms = np.sqrt(np.diag(covariance))
@@ -91,7 +94,7 @@ def test_predicted_correlations_solve_the_lyapunov_equation(faults: tuple[Event,
 def test_correlations_from_spectra_lack_the_power_outside_the_band() -> None:
     """At lag zero by the stated amount, at no lag by more than 3 %; standard errors are of the same size."""
     made = snapshots_of(LAB)
-    whole, band = (made.correlations(latest(lagged=lagged)) for lagged in (True, False))
+    whole, band = (correlation_snapshot(made, latest(lagged=lagged)) for lagged in (True, False))
     assert whole.lags_s == band.lags_s
     assert whole.band_hz is None
     assert band.band_hz == pytest.approx((2.9, 150.1))
@@ -112,7 +115,7 @@ def test_short_segments_do_not_reduce_correlations() -> None:
     machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:2], "window": window})
     made = snapshots_of(machine)
     whole, band = (
-        made.correlations(LatestData(window_of(machine, stream(SECONDS, SEED), lagged=lagged), 1.0))
+        correlation_snapshot(made, LatestData(window_of(machine, stream(SECONDS, SEED), lagged=lagged), 1.0))
         for lagged in (True, False)
     )
     late = np.array(whole.lags_s) > 0.08
@@ -133,7 +136,7 @@ def test_standard_errors_from_spectra_agree_with_the_scatter_of_windows() -> Non
         smooth = oaconvolve(white, np.hanning(40)[:, None], "same", axes=0)
         blocks_ = synthetic({"y1": smooth[:, 0], "z1": smooth[:, 0] + smooth[:, 1]})
         window = window_of(machine, blocks_, lagged=False)
-        (pair,) = snapshots_of(NOTHING).correlations(LatestData(window, 1.0), ["y1"], ["z1"]).pairs
+        (pair,) = correlation_snapshot(snapshots_of(NOTHING), LatestData(window, 1.0), ["y1"], ["z1"]).pairs
         values.append(numbers(pair.measured))
         errors.append(numbers(pair.standard_error))
     ratio = np.std(values, axis=0, ddof=1) / np.mean(errors, axis=0)
@@ -141,7 +144,7 @@ def test_standard_errors_from_spectra_agree_with_the_scatter_of_windows() -> Non
 
 
 def test_densities_scatter_around_theory_with_their_degrees_of_freedom() -> None:
-    snapshot = snapshots_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
+    snapshot = spectrum_snapshot(snapshots_of(LAB), latest(K_BY), [name for name in NAMES if name != "theta"])
     assert snapshot.left_out_hz is not None
     frequencies_hz = np.array(snapshot.frequencies_hz)
     assert (frequencies_hz[0], frequencies_hz[-1], frequencies_hz.size) == (3.0, 150.0, 736)
@@ -166,7 +169,9 @@ def test_densities_scatter_around_theory_with_their_degrees_of_freedom() -> None
 
 def test_densities_are_in_units_of_the_channel_or_si() -> None:
     made, data = snapshots_of(LAB), latest()
-    own, si = (made.spectra(data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI"))
+    own, si = (
+        spectrum_snapshot(made, data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI")
+    )
     assert [density.unit for density in own.densities] == ["um^2/Hz", "(mm/s)^2/Hz"]
     assert [density.unit for density in si.densities] == ["m^2/Hz", "(m/s)^2/Hz"]
     assert numbers(own.densities[0].measured) == pytest.approx(1e12 * numbers(si.densities[0].measured), rel=1e-5)
@@ -183,8 +188,8 @@ def test_coherence_and_phase_of_a_delayed_channel() -> None:
     white = rng.standard_normal((round(71 * LAB.rate_hz), 2))
     stream_ = synthetic({"y1": white[:, 0], "z1": np.roll(white[:, 0], 2), "y2": white[:, 1]})
     machine = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.name in ("y1", "z1", "y2"))})
-    snapshot = snapshots_of(machine).spectra(
-        LatestData(window_of(machine, stream_), 1.0), (), ["y1", "y1"], ["z1", "y2"]
+    snapshot = spectrum_snapshot(
+        snapshots_of(machine), LatestData(window_of(machine, stream_), 1.0), (), ["y1", "y1"], ["z1", "y2"]
     )
     late, foreign = snapshot.cross
     frequencies_hz = np.array(snapshot.frequencies_hz)
@@ -202,7 +207,7 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
     machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:1], "window": window})
     rng = np.random.default_rng(4)
     stream_ = synthetic({"y1": rng.standard_normal(round(71 * LAB.rate_hz))})
-    snapshot = snapshots_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0))
+    snapshot = spectrum_snapshot(snapshots_of(machine), LatestData(window_of(machine, stream_), 1.0))
     assert snapshot.averaged_lines == 3
     assert snapshot.line_spacing_hz == pytest.approx(0.6)
     assert len(snapshot.frequencies_hz) == 828
@@ -213,7 +218,10 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
 
 def test_a_part_of_the_band_can_be_selected() -> None:
     made = snapshots_of(LAB)
-    part, whole = made.spectra(latest(), ["y2"], band_hz=(25.0, 35.0)), made.spectra(latest(), ["y2"])
+    part, whole = (
+        spectrum_snapshot(made, latest(), ["y2"], band_hz=(25.0, 35.0)),
+        spectrum_snapshot(made, latest(), ["y2"]),
+    )
     assert (part.frequencies_hz[0], part.frequencies_hz[-1]) == (25.0, 35.0)
     at = whole.frequencies_hz.index(25.0)
     count = len(part.frequencies_hz)
@@ -221,14 +229,18 @@ def test_a_part_of_the_band_can_be_selected() -> None:
     nominal = numbers(whole.densities[0].nominal)[at : at + count]
     assert numbers(part.densities[0].nominal) == pytest.approx(nominal, rel=1e-4)
     with pytest.raises(SnapshotError, match=r"band is 200 to 300 Hz, expected at least 0\.4 Hz within 3 to 150"):
-        made.spectra(latest(), ["y2"], band_hz=(200.0, 300.0))
+        spectrum_snapshot(made, latest(), ["y2"], band_hz=(200.0, 300.0))
 
 
 def test_without_known_parameters_there_is_no_theory() -> None:
     reason = "the machine's parameters are not known, so there is no theory to predict from"
     data, made = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), snapshots_of(NOTHING)
-    correlations, spectra, orbits = (made.correlations(data), made.spectra(data, (), ["y1"]), made.orbits(data, 2))
-    known = snapshots_of(LAB).correlations(latest())
+    correlations, spectra, orbits = (
+        correlation_snapshot(made, data),
+        spectrum_snapshot(made, data, (), ["y1"]),
+        orbit_snapshot(made, data, 2),
+    )
+    known = correlation_snapshot(snapshots_of(LAB), latest())
     assert [pair.measured for pair in correlations.pairs] == [pair.measured for pair in known.pairs]
     for snapshot in (correlations, spectra, orbits):
         theory = snapshot.theory
@@ -248,11 +260,14 @@ def test_channels_at_places_outside_the_model_have_only_levels(elsewhere: str, h
     machine = NOTHING.model_copy(update={"sensors": moved})
     data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", ())
     made = snapshots_of(machine)
-    spectra, correlations = made.spectra(data), made.correlations(data)
+    spectra, correlations = spectrum_snapshot(made, data), correlation_snapshot(made, data)
     assert [one.channel for one in spectra.densities] == held
     assert {name for pair in correlations.pairs for name in (pair.first, pair.second)} == set(held)
     assert all(("only levels are watched" in one.reason) is not bool(held) for one in (spectra, correlations))
-    for refused in (lambda: made.spectra(data, ["y1"]), lambda: made.correlations(data, ["y1"], ["y1"])):
+    for refused in (
+        lambda: spectrum_snapshot(made, data, ["y1"]),
+        lambda: correlation_snapshot(made, data, ["y1"], ["y1"]),
+    ):
         with pytest.raises(SnapshotError, match="of y1 only levels are watched"):
             refused()
 
@@ -260,19 +275,23 @@ def test_channels_at_places_outside_the_model_have_only_levels(elsewhere: str, h
 def test_a_window_not_evaluated_has_only_nominal_theory() -> None:
     why = "demo/lab: gain of y1 is 20 % lower than when it was commissioned"
     data = LatestData(latest().window, 1.0, (), why)
-    snapshot = snapshots_of(LAB).correlations(data)
+    snapshot = correlation_snapshot(snapshots_of(LAB), data)
     assert (snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", why)
     assert snapshot.theory.changes == ()
     assert all(pair.estimated is None and pair.estimated_z is None for pair in snapshot.pairs)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
-    unsaid = snapshots_of(LAB).spectra(LatestData(latest().window, 1.0))
+    unsaid = spectrum_snapshot(snapshots_of(LAB), LatestData(latest().window, 1.0))
     assert unsaid.theory.estimated_reason == "no parameter was read in this window"
 
 
 def test_before_the_first_window_only_paths_of_orbits_are_shown() -> None:
     data = LatestData(None, 0.25, (), "", stream(SECONDS, SEED)[:20])
     made = snapshots_of(LAB)
-    correlations, spectra, orbits = made.correlations(data), made.spectra(data), made.orbits(data, 35)
+    correlations, spectra, orbits = (
+        correlation_snapshot(made, data),
+        spectrum_snapshot(made, data),
+        orbit_snapshot(made, data, 35),
+    )
     for snapshot in (correlations, spectra, orbits):
         assert snapshot.reason == "demo/lab: no window of 60 s is full yet, 25% of one is there"
         assert (snapshot.start_ns, snapshot.end_ns, snapshot.speed_rad_s) == (None, None, None)
@@ -288,27 +307,27 @@ def test_a_stuck_channel_has_no_theory_and_no_coherence() -> None:
         for b in stream(SECONDS, SEED)
     ]
     data = LatestData(window_of(LAB, stream_), 1.0, (), "y1 is stuck")
-    snapshot = snapshots_of(LAB).correlations(data)
+    snapshot = correlation_snapshot(snapshots_of(LAB), data)
     assert snapshot.theory.nominal_reason.startswith("demo/lab: no fluctuation in y1")
     assert snapshot.theory.estimated_reason == "y1 is stuck"
     assert set(snapshot.pairs[0].measured) <= {0.0, -0.0}
     assert snapshot.pairs[0].nominal is None
-    (cross,) = json.loads(snapshots_of(LAB).spectra(data, (), ["y1"], ["y2"]).model_dump_json())["cross"]
+    (cross,) = json.loads(spectrum_snapshot(snapshots_of(LAB), data, (), ["y1"], ["y2"]).model_dump_json())["cross"]
     assert cross["coherence"][0] is None
 
 
 def test_channels_are_chosen_by_name_and_velocities_by_default_without_displacements() -> None:
     made = snapshots_of(LAB)
-    pairs = made.correlations(latest(), ["z2", "y1"]).pairs
+    pairs = correlation_snapshot(made, latest(), ["z2", "y1"]).pairs
     assert [(pair.first, pair.second) for pair in pairs] == [("z2", "z2"), ("y1", "y1")]
     with pytest.raises(SnapshotError, match="channel is 'q'"):
-        made.spectra(latest(), ["q"])
+        spectrum_snapshot(made, latest(), ["q"])
     rates = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.quantity == "velocity")})
     data = LatestData(window_of(rates, stream(SECONDS, SEED)), 1.0)
-    snapshot = snapshots_of(rates).spectra(data)
+    snapshot = spectrum_snapshot(snapshots_of(rates), data)
     assert [density.channel for density in snapshot.densities] == ["y1_dot", "z1_dot", "y2_dot", "z2_dot"]
     assert (snapshot.rotation_hz, snapshot.left_out_hz) == (None, None)
-    orbits = snapshots_of(rates).orbits(data)
+    orbits = orbit_snapshot(snapshots_of(rates), data)
     assert orbits.orbits == ()
     assert orbits.reason.endswith("measured displacements: none")
     assert orbits.path_reason == orbits.reason  # nothing of revolutions that nobody can see
@@ -323,11 +342,11 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr("service.analysis.prediction.predict", counted)
     made = snapshots_of(LAB)
-    first = made.correlations(latest())
-    made.spectra(latest())
-    assert made.correlations(latest()) == first
+    first = correlation_snapshot(made, latest())
+    spectrum_snapshot(made, latest())
+    assert correlation_snapshot(made, latest()) == first
     assert len(asked) == 1
-    made.correlations(latest(K_BY))
+    correlation_snapshot(made, latest(K_BY))
     assert len(asked) == 2
 
 
@@ -341,7 +360,7 @@ def test_an_answer_on_a_window_is_made_once_for_equal_requests() -> None:
             made += 1
             if fails:
                 raise SnapshotError("not now")
-            return subject.orbits(data)
+            return orbit_snapshot(subject, data)
 
         before = made
         body = answers.of(question, data, make, **of).body
@@ -351,7 +370,7 @@ def test_an_answer_on_a_window_is_made_once_for_equal_requests() -> None:
     later = replace(data, blocks=data.blocks[1:])
     count, body = asked(data)
     assert count == 1
-    assert OrbitSnapshot.model_validate_json(body) == subject.orbits(data)
+    assert OrbitSnapshot.model_validate_json(body) == orbit_snapshot(subject, data)
     assert asked(later) == (0, body)
     assert asked(replace(data, filled=0.9))[0] == 1
     assert asked(latest(K_BY))[0] == 1
@@ -375,9 +394,9 @@ def test_snapshots_are_read_back_from_json(model: type[BaseModel]) -> None:
     model.model_validate(example(model))
     lab = snapshots_of(LAB)
     made: dict[type[BaseModel], Callable[[LatestData], BaseModel]] = {
-        CorrelationSnapshot: lab.correlations,
-        SpectrumSnapshot: lambda data: lab.spectra(data, (), ["y1"], ["y2"]),
-        OrbitSnapshot: lambda data: lab.orbits(data, 8),
+        CorrelationSnapshot: partial(correlation_snapshot, lab),
+        SpectrumSnapshot: partial(spectrum_snapshot, lab, first=["y1"], second=["y2"]),
+        OrbitSnapshot: partial(orbit_snapshot, lab, revolutions=8),
     }
     for data in (latest(), LatestData()):
         snapshot = made[model](data)
@@ -387,6 +406,6 @@ def test_snapshots_are_read_back_from_json(model: type[BaseModel]) -> None:
 
 
 def test_without_samples_there_are_no_revolutions() -> None:
-    none = snapshots_of(LAB).orbits(LatestData(None, 0.0, (), "", ()), 20)
+    none = orbit_snapshot(snapshots_of(LAB), LatestData(None, 0.0, (), "", ()), 20)
     assert (none.revolutions, none.path_reason) == (0, "no samples have come in")
     assert all(orbit.path is None for orbit in none.orbits)

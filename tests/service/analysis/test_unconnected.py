@@ -17,6 +17,7 @@ from service.analysis.past import Past
 from service.analysis.recorded import Held, Sampled
 from service.analysis.recorded_window import recorded_window
 from service.analysis.snapshots.machine import LatestData
+from service.analysis.snapshots.orbit import orbit_snapshot
 from service.analysis.snapshots.plots import (
     centreline_series,
     full_spectrum_snapshot,
@@ -24,6 +25,7 @@ from service.analysis.snapshots.plots import (
     waterfall_snapshot,
     waveform_snapshot,
 )
+from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
 from service.runtime.remote import latest_from_bytes, latest_to_bytes
@@ -70,7 +72,11 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
     data, samples = shown(way, tmp_path, "z1")
     said = "no data of z1: sent as NaN, not connected"
     made = snapshots_of(KIT)
-    spectra, correlations, orbits = made.spectra(data), made.correlations(data), made.orbits(data, 4)
+    spectra, correlations, orbits = (
+        spectrum_snapshot(made, data),
+        correlation_snapshot(made, data),
+        orbit_snapshot(made, data, 4),
+    )
     assert (spectra.reason, correlations.reason, orbits.reason) == (said, said, said)
     assert {spectra.theory.nominal_reason, correlations.theory.nominal_reason} == {said}
     density = {one.channel: one for one in spectra.densities}
@@ -96,7 +102,11 @@ def test_a_dead_channel_is_shown_as_no_data(way: str, tmp_path: Path) -> None:
 def test_a_stuck_channel_is_not_shown_as_a_sensor_that_measures_0(way: str, tmp_path: Path) -> None:
     data, _ = shown(way, tmp_path, "z1", value=100.0)
     made = snapshots_of(KIT)
-    spectra, correlations, orbits = made.spectra(data), made.correlations(data), made.orbits(data, 4)
+    spectra, correlations, orbits = (
+        spectrum_snapshot(made, data),
+        correlation_snapshot(made, data),
+        orbit_snapshot(made, data, 4),
+    )
     for one in (spectra, correlations, orbits):
         assert one.reason.startswith("z1: repeated the value 100 µm")
     assert spectra.theory.nominal_reason == spectra.reason
@@ -131,7 +141,7 @@ def test_with_a_shaft_angle_that_stopped_a_machine_has_no_speed(way: str, tmp_pa
         source = recorded(recording(tmp_path / "made.mcap", stream, KIT)).source
         lagged = evaluator_for(Installed(KIT)).needs_lags
         data = recorded_window(source, KIT, "demo/lab", None, None, lagged=lagged)
-    orbits, spectra = snapshots_of(KIT).orbits(data), snapshots_of(KIT).spectra(data)
+    orbits, spectra = orbit_snapshot(snapshots_of(KIT), data), spectrum_snapshot(snapshots_of(KIT), data)
     assert (orbits.speed_rad_s, spectra.speed_rad_s, spectra.rotation_hz) == (None, None, None)
     assert [one.ellipse for one in orbits.orbits] == [None, None]
     assert "theta: the shaft angle stood still" in orbits.reason
@@ -142,7 +152,7 @@ def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
     for block in scenario_blocks(SECONDS):
         gap = np.full((len(block.samples), 1), np.nan, np.float32)
         monitor.step(replace(block, samples=np.hstack([block.samples.astype(np.float32), gap])))
-    spectra = snapshots_of(RIG).spectra(held_now(monitor.window, monitor.health(), monitor.blocks))
+    spectra = spectrum_snapshot(snapshots_of(RIG), held_now(monitor.window, monitor.health(), monitor.blocks))
     assert spectra.reason == "no data of DE-H: sent as NaN, not connected"
     assert (spectra.theory.nominal_reason, spectra.theory.estimated_reason) == ("", "")
     assert {one.nominal is not None for one in spectra.densities} == {True}
@@ -185,7 +195,7 @@ def test_plots_of_the_history_go_on_when_a_sensor_dies() -> None:
 @pytest.mark.parametrize("way", ["live", "recorded"])
 def test_without_its_angle_a_machine_has_no_speed_rather_than_0(way: str, tmp_path: Path) -> None:
     data, samples = shown(way, tmp_path, "theta")
-    orbits = snapshots_of(KIT).orbits(data, 4)
+    orbits = orbit_snapshot(snapshots_of(KIT), data, 4)
     assert orbits.speed_rad_s is None
     assert [one.ellipse for one in orbits.orbits] == [None, None]
     assert "no data of theta" in orbits.reason
@@ -212,7 +222,7 @@ def test_a_recorded_window_with_a_missing_channel_is_shown_as_live(tmp_path: Pat
     source = recorded(recording(tmp_path / "made.mcap", blocks, KIT)).source
     lagged = evaluator_for(Installed(KIT)).needs_lags
     data = recorded_window(source, KIT, "demo/lab", None, monitor.health().latest, lagged=lagged)
-    now, then = (snapshots_of(KIT).spectra(one) for one in (live, data))
+    now, then = (spectrum_snapshot(snapshots_of(KIT), one) for one in (live, data))
     assert now.reason == then.reason == "no data of z1: sent as NaN, not connected"
     for one, other in zip(now.densities, then.densities, strict=True):
         assert (one.rms is None) == (other.rms is None) == (one.channel == "z1")
