@@ -22,7 +22,7 @@ class AuditLog extends LiveElement {
   #before = null;
   refreshS = 15;
   #rows = html("div");
-  #older = html("button", { type: "button", hidden: true, click: () => this.#extend() }, "Older");
+  #older = html("button", { type: "button", hidden: true, click: () => this.attempt(() => this.#extend()) }, "Older");
 
   connectedCallback() {
     super.connectedCallback();
@@ -41,14 +41,10 @@ class AuditLog extends LiveElement {
   }
 
   async #extend() {
-    try {
-      const found = await monitor.ask(`${API}/audit?limit=${PAGE}&before=${this.#before}`);
-      this.#entries.push(...found.entries);
-      this.#before = found.next_before;
-      this.#show();
-    } catch (error) {
-      this.refused(error instanceof Error ? error.message : String(error));
-    }
+    const found = await monitor.ask(`${API}/audit?limit=${PAGE}&before=${this.#before}`);
+    this.#entries.push(...found.entries);
+    this.#before = found.next_before;
+    this.#show();
   }
 
   #show() {

@@ -71,16 +71,14 @@ class TokenTable extends LiveElement {
     event.preventDefault();
     const scopes = this.#scopes.filter((one) => one.checked).map((one) => one.value);
     const days = this.#days.value ? Number(this.#days.value) : null;
-    try {
+    this.#made.hidden = true;
+    await this.attempt(async () => {
       const { token, text } = await monitor.order(TOKENS, { name: this.#name.value.trim(), scopes, days });
       this.message.textContent = "";
       this.#name.value = "";
       this.#show(token, text);
       await this.load();
-    } catch (error) {
-      this.#made.hidden = true;
-      this.refused(`Not created. ${error instanceof Error ? error.message : String(error)}`);
-    }
+    }, "Not created. ");
   }
 
   /** Show the text of a new token until its creator confirms that it is stored safely. @param {TokenEntry} token @param {string} text */
@@ -105,13 +103,11 @@ class TokenTable extends LiveElement {
   async #revoke(token, own) {
     const warning = own ? "It is the one you are signed in with: you will be signed out immediately." : "Its next request will be refused. This cannot be undone; a new token can be created.";
     if (!(await confirmed(`Revoke the token of ${token.name}?`, "Revoke", html("p", {}, warning)))) return;
-    try {
+    await this.attempt(async () => {
       await monitor.ask(`${TOKENS}/${token.token_id}`, { method: "DELETE" });
       this.message.textContent = `The token of ${token.name} is revoked.`;
       await this.load();
-    } catch (error) {
-      this.refused(`Not revoked. ${error instanceof Error ? error.message : String(error)}`);
-    }
+    }, "Not revoked. ");
   }
 }
 

@@ -17,7 +17,6 @@ class AlarmHistory extends MachineElement {
   /** @type {number | null} */
   #before = null;
   needsWhole = false;
-  #message = "";
 
   connectedCallback() {
     super.connectedCallback();
@@ -33,14 +32,12 @@ class AlarmHistory extends MachineElement {
 
   async #load() {
     const older = this.#before === null ? "" : `&before=${this.#before}`;
-    try {
+    await this.attempt(async () => {
       const found = await monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${PAGE}${older}`);
       this.#events.push(...found.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data));
       this.#before = found.next_before;
-      this.#message = "";
-    } catch (error) {
-      this.#message = error instanceof Error ? error.message : String(error);
-    }
+      this.message.textContent = "";
+    });
     this.#lay();
   }
 
@@ -57,7 +54,7 @@ class AlarmHistory extends MachineElement {
     }));
     renew(
       this,
-      html("p", { class: "message", role: "status" }, this.#message),
+      this.message,
       html("h2", {}, `History of ${this.place}`),
       timeLine(this.#events, this.health?.report?.end_ns ?? 0),
       rows.length ? table(["time", "what", "event", "by", "reason"], rows, "") : html("p", { class: "note" }, "This machine has no alarm events yet."),

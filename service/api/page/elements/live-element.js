@@ -51,15 +51,24 @@ export class LiveElement extends HTMLElement {
     this.#again = this.#loading;
     if (this.#loading || document.hidden) return;
     this.#loading = true;
+    this.answered = await this.attempt(() => this.ask());
+    this.#loading = false;
+    if (this.#again && this.isConnected) this.load();
+  }
+
+  /**
+   * Do something that the monitor may refuse, and show why.
+   * @param {() => Promise<unknown>} act
+   * @param {string} [failed] begins the message if it is refused
+   * @returns {Promise<boolean>} whether it was done
+   */
+  async attempt(act, failed = "") {
     try {
-      await this.ask();
-      this.answered = true;
+      await act();
+      return true;
     } catch (error) {
-      this.answered = false;
-      this.refused(error instanceof Error ? error.message : String(error));
-    } finally {
-      this.#loading = false;
-      if (this.#again && this.isConnected) this.load();
+      this.refused(failed + (error instanceof Error ? error.message : String(error)));
+      return false;
     }
   }
 

@@ -1,5 +1,6 @@
 import { clock, figure, lasting, percent, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 import "../elements/state-mark.js";
 import "../machine/level-table.js";
@@ -15,7 +16,7 @@ const RAISED = new Set(["raised", "escalated"]);
 /** @import { AlarmEventData as AlarmEvent, Health, ReplayJob, Report } from "../monitor/records.d.ts" */
 
 /** Results of an offline replay: state, parameters and levels over time, alarms, and the report of any window. */
-class OfflineResult extends HTMLElement {
+class OfflineResult extends LiveElement {
   /** @type {ReplayJob | null} */
   #job = null;
   /** Every n-th window. @type {Report[]} */
@@ -24,7 +25,7 @@ class OfflineResult extends HTMLElement {
   #events = [];
   #every = 1;
   #wanted = -1;
-  #message = html("p", { class: "message", role: "alert" });
+  message = html("p", { class: "message", role: "alert" });
   #facts = html("p", { class: "note" });
   #strip = /** @type {any} */ (html("state-strip"));
   #scrub = /** @type {HTMLInputElement} */ (html("input", { type: "range", min: 0, step: 1, value: 0, "aria-label": "Window", input: () => this.#go(Number(this.#scrub.value)) }));
@@ -48,12 +49,8 @@ class OfflineResult extends HTMLElement {
   async show(job) {
     if (this.#job || !job.summary) return;
     this.#job = job;
-    try {
-      await this.#load(job.summary.windows);
-    } catch (error) {
-      lay(this, this.#message);
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    }
+    const { windows } = job.summary;
+    await this.attempt(() => this.#load(windows));
   }
 
   /** @param {number} windows */
@@ -80,7 +77,7 @@ class OfflineResult extends HTMLElement {
       this.#alarms,
       html("h2", {}, "Window by window"),
       html("div", { class: "scrubber" }, jump(-1, "◂ alarm event"), this.#scrub, jump(1, "alarm event ▸"), this.#place),
-      this.#message,
+      this.message,
       this.#window,
       ...this.#tables,
       this.#plots,
@@ -123,12 +120,10 @@ class OfflineResult extends HTMLElement {
     if (!report) {
       await new Promise((resolve) => setTimeout(resolve, WAIT_MS)); // dragging the scrubber passes over many windows
       if (this.#wanted !== at) return;
-      try {
+      await this.attempt(async () => {
         [report] = (await monitor.ask(`${this.#path}/reports?offset=${at}&limit=1`)).reports;
-        this.#message.textContent = "";
-      } catch (error) {
-        this.#message.textContent = error instanceof Error ? error.message : String(error);
-      }
+        this.message.textContent = "";
+      });
       if (this.#wanted !== at || !report) return;
     }
     this.#stand(report, at);
@@ -168,9 +163,9 @@ class OfflineResult extends HTMLElement {
     const moments = [...new Set(this.#events.map((one) => ends.findIndex((end) => end >= one.time_ns)).filter((at) => at >= 0).map((at) => at * this.#every))].sort((one, other) => one - other);
     const here = Number(this.#scrub.value);
     const found = direction > 0 ? moments.find((at) => at > here) : moments.reverse().find((at) => at < here);
-    if (found === undefined) this.#message.textContent = direction > 0 ? "No alarm event after this window." : "No alarm event before this window.";
+    if (found === undefined) this.message.textContent = direction > 0 ? "No alarm event after this window." : "No alarm event before this window.";
     else {
-      this.#message.textContent = "";
+      this.message.textContent = "";
       this.#go(found, true);
     }
   }

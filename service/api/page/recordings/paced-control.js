@@ -1,5 +1,6 @@
 import { clock, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 import { counted } from "./replay-list.js";
 import "./window-plots.js";
@@ -9,12 +10,12 @@ const FOLLOW_MS = 15_000;
 /** @import { ReplayJob } from "../monitor/records.d.ts" */
 
 /** Controls of a paced replay on the network: pause, resume, seek. */
-class PacedControl extends HTMLElement {
+class PacedControl extends LiveElement {
   #said = html("p", { class: "number" });
   #pause = html("button", { type: "button", click: () => this.#order(this.#job?.state === "paused" ? "resume" : "pause") });
   #seek = /** @type {HTMLInputElement} */ (html("input", { type: "range", min: 0, max: 1, step: "any", "aria-label": "Place in the data", input: () => { this.#tell(); this.#follow(true); }, change: () => this.#order("seek", { to_ns: Math.round(this.#at()) }) }));
   #place = html("output", { class: "number" });
-  #message = html("p", { class: "message", role: "alert" });
+  message = html("p", { class: "message", role: "alert" });
   #tools = html("div", { class: "scrubber" });
   #plots = /** @type {any} */ (null);
   #followed = -Infinity;
@@ -28,10 +29,11 @@ class PacedControl extends HTMLElement {
   #waiting = 0;
 
   connectedCallback() {
+    super.connectedCallback();
     const step = (/** @type {number} */ by_s, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#order("seek", { by_s }) }, text);
     lay(this.#tools, this.#pause, step(-10, "− 10 s"), step(10, "+ 10 s"), this.#seek, this.#place);
     for (const [kind, held] of /** @type {[string, boolean][]} */ ([["pointerdown", true], ["pointerup", false], ["pointercancel", false]])) this.#seek.addEventListener(kind, () => { this.#held = held; });
-    lay(this, this.#said, this.#tools, this.#message, html("h2", {}, "Progress"));
+    lay(this, this.#said, this.#tools, this.message, html("h2", {}, "Progress"));
   }
 
   /** @param {ReplayJob} job */
@@ -44,7 +46,7 @@ class PacedControl extends HTMLElement {
     lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${counted(job.progress.messages, "message")} sent.` : ".");
     if (first) {
       this.append((this.#plots = html("window-plots", { place: job.recordings[0].split("/").slice(0, 2).join("/"), replay: job.id })));
-      await this.#measure(job);
+      await this.attempt(() => this.#measure(job));
     }
     this.#stand();
   }
@@ -67,14 +69,10 @@ class PacedControl extends HTMLElement {
 
   /** Time span of the replay's data. @param {ReplayJob} job */
   async #measure(job) {
-    try {
-      const all = await Promise.all(job.recordings.slice(0, 50).map((id) => monitor.ask(`${API}/recordings/${id}`)));
-      const from = Math.max(job.from_ns ?? 0, Math.min(...all.map((one) => one.data_start_ns)));
-      this.#span = [from, Math.min(job.to_ns ?? Infinity, Math.max(...all.map((one) => one.data_end_ns)))];
-      this.#seek.setAttribute("aria-label", `Place in the data, ${stretch(...this.#span)}`);
-    } catch (error) {
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    }
+    const all = await Promise.all(job.recordings.slice(0, 50).map((id) => monitor.ask(`${API}/recordings/${id}`)));
+    const from = Math.max(job.from_ns ?? 0, Math.min(...all.map((one) => one.data_start_ns)));
+    this.#span = [from, Math.min(job.to_ns ?? Infinity, Math.max(...all.map((one) => one.data_end_ns)))];
+    this.#seek.setAttribute("aria-label", `Place in the data, ${stretch(...this.#span)}`);
   }
 
   #at() {
@@ -95,12 +93,12 @@ class PacedControl extends HTMLElement {
     this.#orders = this.#orders
       .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order))
       .then((job) => {
-        this.#message.textContent = "";
+        this.message.textContent = "";
         const { state, progress } = this.#job ?? job; // the answer does not yet have the new position
         return state === "running" || state === "paused" ? this.show({ ...job, progress }) : undefined;
       })
       .catch((error) => {
-        this.#message.textContent = error instanceof Error ? error.message : String(error);
+        this.message.textContent = error instanceof Error ? error.message : String(error);
         before = undefined;
       })
       .finally(() => {

@@ -17,7 +17,7 @@ class ReplayView extends LiveElement {
   #bar = /** @type {HTMLProgressElement} */ (html("progress", { max: 1, value: 0, "aria-label": "Progress of the replay" }));
   #state = html("p", { role: "status" });
   message = html("p", { class: "message", role: "alert" });
-  #stop = html("button", { type: "button", hidden: true, click: () => this.#end() }, "Stop");
+  #stop = html("button", { type: "button", hidden: true, click: () => this.attempt(() => monitor.ask(this.#path, { method: "DELETE" })) }, "Stop");
   #body = html("div");
   /** @type {EventSource | null} */
   #stream = null;
@@ -74,14 +74,6 @@ class ReplayView extends LiveElement {
     const tag = job.mode === "paced" ? "paced-control" : ended && job.summary ? "offline-result" : "";
     if (tag && this.#body.firstElementChild?.localName !== tag) lay(this.#body, html(tag, { replay: job.id }));
     /** @type {any} */ (this.#body.firstElementChild)?.show(job);
-  }
-
-  async #end() {
-    try {
-      await monitor.ask(this.#path, { method: "DELETE" });
-    } catch (error) {
-      this.refused(error instanceof Error ? error.message : String(error));
-    }
   }
 }
 
