@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,16 +26,11 @@ _MOST_BREAKS = 3
 """Most breaks in the stream that are reported individually."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """Findings about the messages of one machine."""
+def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> tuple[list[str], list[str]]:
+    """What arrives under a machine's keys, in words, and what is missing or differs from the machine file.
 
-    lines: tuple[str, ...]  # what arrives, in words
-    troubles: tuple[str, ...]  # what is missing or differs from the machine file
-
-
-def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arrival:
-    """Examine the messages that arrived under a machine's keys, given in order of arrival."""
+    The messages are given in order of arrival.
+    """
     place, keys = machine.title, machine.keys
     troubles: list[str] = []
     announced = [one.payload for one in messages if one.key == keys.descriptor]
@@ -50,7 +44,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
     if not stream:
         others = sorted({one.key for one in messages})
         heard = f"; heard were {', '.join(others)}" if others else ""
-        return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
+        return [f"{place}: no sample blocks"], [f"nothing arrived under {keys.stream}{heard}", *troubles]
     gate, missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
     refused, rates = defaultdict[str, list[str]](list), set[float]()
     accepted: list[SampleBlock] = []
@@ -90,7 +84,7 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
         newest = rfc3339(accepted[-1].end_ns)
         lines.append(f"newest sample of {newest}, {three_digits(abs(ahead_s))} s {clocks} this computer's clock")
         lines += _of_samples(machine, accepted, troubles)
-    return Arrival(tuple(lines), tuple(troubles))
+    return lines, troubles
 
 
 def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: list[str]) -> list[str]:

@@ -217,10 +217,10 @@ def doctor(
         close()
     finally:
         session.close()
-    found = examined(known, heard)
-    for line in found.lines:
+    lines, troubles = examined(known, heard)
+    for line in lines:
         typer.echo(line)
-    for trouble in found.troubles:
+    for trouble in troubles:
         typer.echo(f"  - {trouble}")
-    if found.troubles:
+    if troubles:
         raise typer.Exit(1)

@@ -61,14 +61,6 @@ class AlarmMark:
     text: str  # what it was, for people
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """What retention decided."""
-
-    kept: dict[str, str]  # files that an alarm keeps, by name, with the alarm
-    dropped: tuple[tuple[Recording, str], ...]  # files to be deleted, with the limit they exceed
-
-
 class Catalogue:
     """Recordings below a directory, which need not exist yet.
 
@@ -238,8 +230,8 @@ def _messages(path: Path, key: str, since_ns: int) -> Iterator[RecordedMessage]:
 
 def decide(
     recordings: Iterable[Recording], marks: Sequence[AlarmMark], settings: RecordingSettings, now_ns: int
-) -> Decision:
-    """Decide which recordings of one machine are kept.
+) -> tuple[dict[str, str], list[tuple[Recording, str]]]:
+    """Files of a machine that an alarm keeps, by name, with the alarm; and those to delete, with the limit exceeded.
 
     Incomplete ones are left alone, and so are those that are not named as the recorder names them.
     """
@@ -252,7 +244,7 @@ def decide(
         *_beyond(alarmed, settings.alarm_keep_gb, settings.alarm_keep_days, "alarm_keep", now_ns),
     ]
     gone = {one.id for one, _ in dropped}
-    return Decision({one.path.name: reasons[one.id] for one in alarmed if one.id not in gone}, tuple(dropped))
+    return {one.path.name: reasons[one.id] for one in alarmed if one.id not in gone}, dropped
 
 
 def alarm_mark(event: StoredEvent) -> AlarmMark:

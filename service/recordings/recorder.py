@@ -397,11 +397,10 @@ class MachineRecorder:
             if str(error) != self._unread_reason:
                 self._log.warning("the history cannot be read: alarms keep no more recordings", why=str(error))
             self._unread_reason = str(error)
-        decision = decide(recordings, self._marks, self.settings, self._age_ns())
-        kept = {one.path.name: one.kept_because for one in recordings if one.kept_because}
-        if decision.kept != kept:
-            write_kept(self.folder, decision.kept, self.settings)
-        for recording, why in decision.dropped:
+        kept, dropped = decide(recordings, self._marks, self.settings, self._age_ns())
+        if kept != {one.path.name: one.kept_because for one in recordings if one.kept_because}:
+            write_kept(self.folder, kept, self.settings)
+        for recording, why in dropped:
             recording.path.unlink(missing_ok=True)
             self._log.info("recording dropped", file=recording.path.name, why=why)
 

@@ -82,35 +82,35 @@ def names(recordings: list[Recording]) -> list[str]:
 
 def test_old_files_are_dropped_but_not_unfinished_or_renamed_ones() -> None:
     files = [stored(-3 * 86_400, 0.001), stored(-86_400, 0.001)]
-    decision = decide(files, [], limits(keep_days=2), NOW_NS)
-    assert [(one.path.name, why) for one, why in decision.dropped] == [
+    _, dropped = decide(files, [], limits(keep_days=2), NOW_NS)
+    assert [(one.path.name, why) for one, why in dropped] == [
         (name_of(NOW_NS - 3 * DAY_NS), "older than keep_days = 2")
     ]
     files = [stored(-9 * 86_400, complete=False), stored(-9 * 86_400, name="bearing-test.mcap"), stored(-9 * 86_400)]
-    decision = decide(files, [], limits(), NOW_NS)
-    assert [one for one, _ in decision.dropped] == files[2:]
+    _, dropped = decide(files, [], limits(), NOW_NS)
+    assert [one for one, _ in dropped] == files[2:]
 
 
 def test_files_around_an_alarm_have_limits_of_their_own() -> None:
     files = [stored(300.0 * n) for n in range(10)]
     mark = AlarmMark(NOW_NS + 1650 * NS, "raised: k_by")  # in the middle of file 5
-    decision = decide(
+    kept, dropped = decide(
         files, [mark], limits(keep_gb=0.1, alarm_before_s=400, alarm_after_s=200, alarm_keep_gb=0.5), NOW_NS
     )
     # 1250 to 1850 s: from file 4 (1200 to 1500 s) to file 6 (1800 to 2100 s); of the others the newest fills 0.1 GB.
-    assert sorted(decision.kept) == names(files[4:7])
-    assert decision.kept[files[4].path.name] == "2026-11-21 14:53:00 UTC raised: k_by"
-    assert decision.dropped == tuple((one, "beyond keep_gb = 0.1") for one in (*files[:4], *files[7:9]))
+    assert sorted(kept) == names(files[4:7])
+    assert kept[files[4].path.name] == "2026-11-21 14:53:00 UTC raised: k_by"
+    assert dropped == [(one, "beyond keep_gb = 0.1") for one in (*files[:4], *files[7:9])]
 
 
 def test_files_around_alarms_are_limited_in_size_and_age() -> None:
     files = [stored(300.0 * n) for n in range(10)]
     marks = [AlarmMark(one.start_ns, "raised") for one in files]
-    decision = decide(files, marks, limits(alarm_keep_gb=0.35), NOW_NS)
-    assert sorted(decision.kept) == names(files[7:])
-    assert [why for _, why in decision.dropped] == ["beyond alarm_keep_gb = 0.35"] * 7
-    decision = decide(files, marks, limits(alarm_keep_days=1), NOW_NS + 2 * DAY_NS)
-    assert (len(decision.dropped), decision.kept) == (10, {})
+    kept, dropped = decide(files, marks, limits(alarm_keep_gb=0.35), NOW_NS)
+    assert sorted(kept) == names(files[7:])
+    assert [why for _, why in dropped] == ["beyond alarm_keep_gb = 0.35"] * 7
+    kept, dropped = decide(files, marks, limits(alarm_keep_days=1), NOW_NS + 2 * DAY_NS)
+    assert (len(dropped), kept) == (10, {})
 
 
 @given(
@@ -125,13 +125,13 @@ def test_limits_hold_and_no_file_is_dropped_without_need(
     files = [stored(300.0 * n, size) for n, size in enumerate(sizes)]
     marks = [AlarmMark(NOW_NS + s * NS, "raised") for s in alarms]
     settings = limits(keep_gb=keep_gb, alarm_keep_gb=alarm_keep_gb)
-    decision = decide(files, marks, settings, NOW_NS)
-    gone = {one.id for one, _ in decision.dropped}
+    kept, dropped = decide(files, marks, settings, NOW_NS)
+    gone = {one.id for one, _ in dropped}
 
     def near(one: Recording) -> bool:
         return any(one.start_ns - 600 * NS <= mark.time_ns <= one.end_ns + 600 * NS for mark in marks)
 
-    assert set(decision.kept) == {one.path.name for one in files if near(one) and one.id not in gone}
+    assert set(kept) == {one.path.name for one in files if near(one) and one.id not in gone}
     for group, limit in (([f for f in files if near(f)], alarm_keep_gb), ([f for f in files if not near(f)], keep_gb)):
         left = [one for one in group if one.id not in gone]
         assert sum(one.size_bytes for one in left) <= limit * 1e9
