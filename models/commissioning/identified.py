@@ -31,6 +31,7 @@ _ONE_SIZE = 0.1  # largest relative deviation of an unbalance's size that may co
 _MOST_TURNED_DEG = 20.0  # between healthy windows; more is another zero of the shaft angle rather than a change
 _MOST_LESS = 0.9  # largest relative reduction of the unbalance in a round
 _Start = tuple[float, float, int, int]
+_Progress = Callable[[int, int], None]  # called with the rounds or windows done, and their total
 # Damping ratios of the planes, and which of their modes the strongest peaks are; the next where one is too far off.
 _DAMPING = ((0.05, 0.05), (0.2, 0.2), (0.05, 0.2), (0.2, 0.05), (0.01, 0.01))
 _MODES = ((0, 0), (1, 1), (0, 1), (1, 0), (0, 2), (2, 0))
@@ -60,12 +61,7 @@ class Identified:
 
 
 def identify(
-    machine: MachineFile,
-    windows: Sequence[WindowStatistics],
-    progress: Callable[[int, int], None] = lambda *_: None,
-    sense: Gyroscopic = "Eq. 27",
-    *,
-    sized: bool = False,
+    machine: MachineFile, windows: Sequence[WindowStatistics], progress: _Progress, sense: Gyroscopic, *, sized: bool
 ) -> Identified:
     """Identify stiffness, damping and unbalance, given masses and shaft, in healthy windows that do not overlap.
 
@@ -111,7 +107,7 @@ def _settled(
     machine: MachineFile,
     whole: Machine,
     windows: Sequence[WindowStatistics],
-    progress: Callable[[int, int], None],
+    progress: _Progress,
     sense: Gyroscopic,
     *,
     sized: bool,
@@ -156,12 +152,7 @@ def _settled(
 
 
 def compare(
-    machine: Machine,
-    windows: Sequence[WindowStatistics],
-    progress: Callable[[int, int], None] = lambda *_: None,
-    sense: Gyroscopic = "Eq. 27",
-    *,
-    sized: bool = False,
+    machine: Machine, windows: Sequence[WindowStatistics], progress: _Progress, sense: Gyroscopic, *, sized: bool
 ) -> Identified:
     """Read healthy windows of a known rotor, as for `identify`; with `sized`, identify the size of its unbalance.
 
@@ -202,11 +193,7 @@ def _size(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> tuple[float, 
 
 
 def _read(
-    machine: Machine,
-    windows: Sequence[WindowStatistics],
-    progress: Callable[[int, int], None] = lambda *_: None,
-    *,
-    sized: bool,
+    machine: Machine, windows: Sequence[WindowStatistics], progress: _Progress = lambda *_: None, *, sized: bool
 ) -> list[tuple[LikelihoodFit, Diagnosis]]:
     found = []
     for window in windows:

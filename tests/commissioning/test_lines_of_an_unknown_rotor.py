@@ -95,4 +95,6 @@ def test_identification_starts_from_a_guess_without_the_lines() -> None:
     shown = [block for block, _ in blocks(scenario.overridden(duration_s=130.0, seed=5_270_042), rotor)]
     machine, seen = with_sensors(told, with_lines(shown, {50.02: 0.1, 100.04: 0.06, 150.06: 0.1}), no_velocity)
     windows = [piece.window for piece in pieces_of([recording(machine, seen)])]
-    assert identify(machine, windows).machine.rotor.c_by_N_s_per_m == pytest.approx(180, rel=0.1)
+    assert identify(
+        machine, windows, lambda *_: None, "Eq. 27", sized=False
+    ).machine.rotor.c_by_N_s_per_m == pytest.approx(180, rel=0.1)
