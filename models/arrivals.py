@@ -40,11 +40,6 @@ class Arrivals:
     longer, it begins with the first block that arrives. At most `bound` blocks wait for a missing one; 0 hands on
     everything as it comes.
 
-    Raises
-    ------
-    ValueError
-        If the bound is negative.
-
     Examples
     --------
     >>> import numpy as np
