@@ -153,13 +153,14 @@ def _swinging(
     if lost < least or not near_hz.size or t_s.size < _FEWEST_SAMPLES:
         return line
     duration_s = float(t_s[1] - t_s[0]) * t_s.size
-    tones = np.exp(2j * np.pi * (base_hz - near_hz)[:, None] * t_s)
+    lowest = (y * np.exp(2j * np.pi * (base_hz - near_hz[0]) * t_s)[:, None]).T[:, np.newaxis]  # at zero frequency
     tried = []
     for swings in (one for one in _SWINGS if one * _SAMPLES_OF_A_SWING <= t_s.size):
         rate = 2 * np.pi * swings / duration_s
         size = 2 * np.pi * most_hz / rate * _SWING_SIZES
         swing = (size[:, None, None] * np.sin(rate * t_s + _SWING_PHASES[:, None])).reshape(-1, t_s.size)
-        powers = np.sum(np.abs((np.exp(-1j * swing)[:, None] * tones) @ y) ** 2, axis=2)
+        turned = np.fft.fft(lowest * np.exp(-1j * swing), 2 * t_s.size)[:, :, : near_hz.size]
+        powers = np.sum(turned.real**2 + turned.imag**2, axis=0)
         best, tone = np.unravel_index(powers.argmax(), powers.shape)
         tried.append((float(powers[best, tone]), float(swings), 2 * np.pi * near_hz[tone] * t_s + swing[best]))
     found, left, angle = 0.0, np.inf, line.angle(t_s)
