@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from models.diagnosis.sensors.disagreement import BROKEN, gain_and_delay, swapped
-from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair
+from models.diagnosis.sensors.kinematics import PairReading, banded, read_pairs, same
 from models.diagnosis.sensors.level import CHECKS, clipped, dropped, gain_jump, stuck
 from models.diagnosis.sensors.noise import noisy
 from models.diagnosis.sensors.phase import no_angle, phase_faults
@@ -68,17 +68,20 @@ def sensor_findings(
         if wrong_angle:
             return (*findings, *wrong_angle)
     pairs = [pair for pair in motion_pairs(window.states) if {pair.first, pair.second} <= set(columns)]
-    bands = {pair: Banded(window, pair) for pair in pairs}
-    exchanged, explained = swapped(window, bands, naming, reference)
-    findings += exchanged
+    compared: list[PairReading] = []
+    if pairs:
+        bands = banded(window, pairs)
+        exchanged, explained = swapped(window, dict(zip(pairs, same(bands).tolist(), strict=True)), naming, reference)
+        findings += exchanged
+        there = [at for at, pair in enumerate(pairs) if pair not in explained]
+        names = [(window.states[pairs[at].first], window.states[pairs[at].second]) for at in there]
+        healthy = [None if reference is None else reference.pair(*each) for each in names]
+        leads = [None if one is None else one.lead_rad_s for one in healthy]
+        compared = read_pairs(window, [pairs[at] for at in there], bands.of(there), leads)
     readings: list[PairReading] = []
-    for pair, own in bands.items():
-        states = window.states[pair.first], window.states[pair.second]
+    for reading in compared:
+        states = reading.first, reading.second
         known = None if reference is None else reference.pair(*states)
-        lead_rad_s = None if known is None else known.lead_rad_s
-        reading = None if pair in explained else read_pair(window, pair, own, lead_rad_s)
-        if reading is None:
-            continue
         if reading.shared >= BROKEN * (known or PERFECT).shared:
             readings.append(reading)
         elif "theta" not in bad:  # or the synchronous part is still there, and its run-out is in the displacement alone

@@ -1,11 +1,12 @@
 """Two sensors of one motion that disagree: wrong gain or delay of one of them, or swapped channels."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from itertools import combinations
 
 import numpy as np
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, delay_course, gain_courses, same
+from models.diagnosis.sensors.kinematics import PairReading, banded, delay_course, gain_courses, same
 from models.diagnosis.sensors.reference import PERFECT, Naming, SensorReference
 from models.diagnosis.window.motion import MotionPair, motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
@@ -37,18 +38,22 @@ def is_drift(finding: SensorFault) -> bool:
 class _Departure:
     """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
-    def __init__(self, window: WindowStatistics, reading: PairReading, reference: SensorReference | None) -> None:
+    def __init__(
+        self,
+        reading: PairReading,
+        reference: SensorReference | None,
+        course: FloatArray,
+        parts: Iterable[tuple[float, float]],
+    ) -> None:
         known = None if reference is None else reference.pair(reading.first, reading.second)
         usual = known or PERFECT
         self.reading, self.known, self.reversed = reading, known is not None, reading.polarity != usual.polarity
         self.log_gain, self.delay_s = reading.log_gain - usual.log_gain, reading.delay_s - usual.delay_s
-        self.gain_z = abs(self.log_gain) / float(np.hypot(reading.log_gain_error, usual.log_gain_spread))
-        self.delay_z = abs(self.delay_s) / float(np.hypot(reading.delay_error_s, usual.delay_spread_s))
-        courses = gain_courses(window, reading)
-        self.course = courses[0][0]
-        parts = [_largest_part(*one) for one in courses]
-        self.course_step, self.course_z = min(parts, key=lambda part: part[1])
-        if len({part[0] > 0 for part in parts}) > 1:
+        self.gain_z = abs(self.log_gain) / math.hypot(reading.log_gain_error, usual.log_gain_spread)
+        self.delay_z = abs(self.delay_s) / math.hypot(reading.delay_error_s, usual.delay_spread_s)
+        self.course = course
+        (self.course_step, self.course_z), (other_step, _) = sorted(parts, key=lambda part: part[1])
+        if (self.course_step > 0) != (other_step > 0):
             self.course_step, self.course_z = 0.0, 0.0  # the noise of one of the two has changed
 
 
@@ -56,7 +61,14 @@ def gain_and_delay(
     window: WindowStatistics, readings: list[PairReading], naming: Naming, reference: SensorReference | None
 ) -> list[SensorFault]:
     """Findings on pairs that see the same motion but differ in gain or delay."""
-    departures = {reading.pair: _Departure(window, reading, reference) for reading in readings}
+    if not readings:
+        return []
+    courses, errors = gain_courses(window, readings)
+    parts = np.stack(_largest_part(courses, errors), axis=-1).swapaxes(0, 1).tolist()  # (n_pairs, 2 ways, 2)
+    departures = {
+        reading.pair: _Departure(reading, reference, *own)
+        for reading, *own in zip(readings, courses[0], parts, strict=True)
+    }
     rate_hz = window.n_samples / window.duration_s
     findings: list[SensorFault] = []
     for departure in departures.values():
@@ -65,7 +77,7 @@ def gain_and_delay(
         steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
         late = departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay
         if late:  # a delay that changes weakens the mean cross-spectrum, like a loss of gain
-            step_s, z = _largest_part(*delay_course(window, departure.reading))
+            step_s, z = map(float, _largest_part(*delay_course(window, departure.reading)))
             steady &= not (z > MOST_ERRORS and abs(step_s) > least_delay)
         moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
         if steady or moving or departure.reversed:
@@ -82,21 +94,24 @@ def gain_and_delay(
     return list(best.values())
 
 
-def _largest_part(course: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Most significant difference of the means after and before a hop boundary, and its size in standard errors."""
-    n = course.size
+def _largest_part(course: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Most significant difference of the means after and before a hop boundary, and its size in standard errors.
+
+    Courses and errors are of shape (…, n_hops), what is found of shape (…,).
+    """
+    n = course.shape[-1]
     if n < 4:
-        return 0.0, 0.0
+        return np.zeros(course.shape[:-1]), np.zeros(course.shape[:-1])
     if n > 5:
-        steps = np.abs(np.diff(course)) / np.hypot(error[1:], error[:-1])
-        error = error * max(1.0, 1.4826 * float(np.median(steps)))
+        steps = np.abs(np.diff(course)) / np.hypot(error[..., 1:], error[..., :-1])
+        error = error * np.maximum(1.0, 1.4826 * np.median(steps, axis=-1, keepdims=True))
     weight = error**-2.0
-    before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * course)
-    after = weight.sum() - before
-    changes = (sums[-1] - sums[:-1]) / after - sums[:-1] / before
+    before, sums = np.cumsum(weight, axis=-1), np.cumsum(weight * course, axis=-1)
+    before, after = before[..., :-1], before[..., -1:] - before[..., :-1]
+    changes = (sums[..., -1:] - sums[..., :-1]) / after - sums[..., :-1] / before
     z = np.abs(changes) / np.sqrt(1 / before + 1 / after)
-    best = int(np.argmax(z))
-    return float(changes[best]), float(z[best])
+    best = z.argmax(axis=-1)[..., None]
+    return np.take_along_axis(changes, best, axis=-1)[..., 0], np.take_along_axis(z, best, axis=-1)[..., 0]
 
 
 def _gain(
@@ -246,26 +261,27 @@ _CROSSED = 0.25
 
 
 def swapped(
-    window: WindowStatistics, bands: Mapping[MotionPair, Banded], naming: Naming, reference: SensorReference | None
+    window: WindowStatistics, alike: Mapping[MotionPair, float], naming: Naming, reference: SensorReference | None
 ) -> tuple[list[SensorFault], set[MotionPair]]:
     """Find exchanges of two channels of one quantity that restore broken pairs; return them and the explained pairs.
 
-    Those pairs are broken that share too little of their motion, at equal time and size, to be two sensors of one.
+    Those pairs are broken that share too little of their motion, at equal time and size, to be two sensors of one:
+    `alike` says how much each shares, see `same`.
     """
 
     def healthy(pair: MotionPair) -> float:
         known = None if reference is None else reference.pair(window.states[pair.first], window.states[pair.second])
         return (known or PERFECT).same
 
-    broken = [pair for pair, own in bands.items() if same(own) < _SUSPECT * healthy(pair)]
+    broken = [pair for pair, part in alike.items() if part < _SUSPECT * healthy(pair)]
     findings: list[SensorFault] = []
     explained: set[MotionPair] = set()
     for one, other in combinations(broken, 2):
         if one.order != other.order or {one, other} & explained:
             continue
         crossed = (MotionPair(one.first, other.second, one.order), MotionPair(other.first, one.second, one.order))
-        now = min(same(bands[pair]) for pair in (one, other))
-        then = min(same(Banded(window, pair)) for pair in crossed)
+        now = min(alike[one], alike[other])
+        then = float(same(banded(window, crossed)).min())
         if then < _RESTORED * min(healthy(one), healthy(other)) or 1 - now < _LEAST_IMPROVEMENT * (1 - then):
             continue
         explained |= {one, other}
@@ -335,7 +351,7 @@ def _exchanged_side(
 def _agrees(window: WindowStatistics, side: int, column: int) -> bool:
     """Whether a column still agrees with a third sensor of its motion, on the side away from the broken pair."""
     pairs = [pair for pair in motion_pairs(window.states) if column == (pair.first if side else pair.second)]
-    return any(same(Banded(window, pair)) > _RESTORED for pair in pairs)
+    return bool(pairs) and bool(np.any(same(banded(window, pairs)) > _RESTORED))
 
 
 def _exchanged(window: WindowStatistics, sizes: FloatArray, side: tuple[int, int], reference: SensorReference) -> bool:

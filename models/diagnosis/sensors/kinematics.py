@@ -9,8 +9,9 @@ high-pass the lead in phase falls as 1/frequency, whereas the lag of a delay gro
 """
 
 import math
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -35,42 +36,59 @@ _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann s
 _FLOOR = 1e-10
 
 
+@dataclass(frozen=True, slots=True)
 class Banded:
-    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
+    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands, of one pair or of several.
 
-    def __init__(self, window: WindowStatistics, pair: MotionPair) -> None:
-        w = 2 * np.pi * window.frequencies_hz
-        columns = np.array([pair.first, pair.second, *_others(window.states, pair)])
-        edges = pair_bands(w.size)
-        counts = np.diff(np.append(edges, w.size))
-        turn = (1j * w) ** pair.order
-        turned = window.spectrum[:, pair.first, columns] * turn[:, None]
-        turned[:, 0] *= turn.conj()
-        own = window.spectrum[:, pair.second, pair.second].real
-        power = own + _FLOOR * own.max() + np.finfo(float).tiny
-        # (n_bands,), angular frequency at the centroid of each band's power
-        self.w: FloatArray = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
-        step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
-        # (n_bands,), number of effectively independent samples
-        self.averages: FloatArray = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
-        # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
-        self.spectra = window.banded_spectrum[:, columns[:, None], columns]
-        self.spectra[:, 0] = np.add.reduceat(turned, edges)
-        self.spectra[:, 1:, 0] = self.spectra[:, 0, 1:].conj()
-        self.spectra /= counts[:, None, None]
-        self.total = self.spectra[:, :2, :2].copy()  # (n_bands, 2, 2), including the synchronous part
-        # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (n_hops, 2); None without vectors
-        self.rotation: tuple[float, ComplexArray] | None = None
-        vectors, speeds = window.rotation_vectors, window.hop_speed_rad_s
-        if vectors is not None:
-            known = np.isfinite(speeds)
-            z = vectors[:, pair.first] * (1j * speeds) ** pair.order
-            both, speed = np.stack([z, vectors[:, pair.second]], axis=1)[known], float(np.mean(speeds[known]))
-            near = int(np.searchsorted(w[edges], speed, side="right")) - 1
-            if near >= 0 and speed <= w[-1]:
-                line = both.T @ both.conj() / len(both)
-                self.total[near] += line / (4 * counts[near] * step_hz)
-            self.rotation = speed, both
+    Index 0 is z, 1 is v.
+    """
+
+    w: FloatArray  # (…, n_bands), angular frequency at the centroid of each band's power
+    averages: FloatArray  # (n_bands,), number of effectively independent samples
+    # (…, n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
+    spectra: ComplexArray
+    total: ComplexArray  # (…, n_bands, 2, 2), including the synchronous part
+    # Mean speed, and the 1x vectors of z and v in each hop of known speed, shape (…, n_hops, 2); None without vectors
+    rotation: tuple[float, ComplexArray] | None
+
+    def of(self, at: int | Sequence[int]) -> "Banded":
+        """Those of one of several pairs, or of some."""
+        rotation = None if self.rotation is None else (self.rotation[0], self.rotation[1][at])
+        return Banded(self.w[at], self.averages, self.spectra[at], self.total[at], rotation)
+
+
+def banded(window: WindowStatistics, pairs: Sequence[MotionPair]) -> Banded:
+    """Cross-spectra of several pairs."""
+    w, edges = 2 * np.pi * window.frequencies_hz, pair_bands(window.frequencies_hz.size)
+    step_hz, counts = window.frequencies_hz[1] - window.frequencies_hz[0], np.diff(np.append(edges, w.size))
+    columns = np.array([[pair.first, pair.second, *_others(window.states, pair)] for pair in pairs], dtype=np.intp)
+    first, second = columns[:, 0], columns[:, 1]
+    turn = np.stack([(1j * w) ** pair.order for pair in pairs], axis=1)
+    turned = window.spectrum[:, first[:, None], columns] * turn[:, :, None]
+    turned[:, :, 0] *= turn.conj()
+    own = window.spectrum[:, second, second].real
+    power = own + _FLOOR * own.max(axis=0) + np.finfo(float).tiny
+    spectra = window.banded_spectrum[:, columns[:, :, None], columns[:, None]]
+    spectra[:, :, 0] = np.add.reduceat(turned, edges)
+    spectra[:, :, 1:, 0] = spectra[:, :, 0, 1:].conj()
+    spectra = np.ascontiguousarray((spectra / counts[:, None, None, None]).swapaxes(0, 1))
+    total, rotation = spectra[:, :, :2, :2].copy(), None
+    vectors, speeds = window.rotation_vectors, window.hop_speed_rad_s
+    if vectors is not None:
+        known = np.isfinite(speeds)
+        z = vectors[:, first] * np.stack([(1j * speeds) ** pair.order for pair in pairs], axis=1)
+        both, speed = np.stack([z, vectors[:, second]], axis=2)[known].swapaxes(0, 1), float(np.mean(speeds[known]))
+        near = int(np.searchsorted(w[edges], speed, side="right")) - 1
+        if near >= 0 and speed <= w[-1]:
+            total[:, near] += both.swapaxes(1, 2) @ both.conj() / (both.shape[1] * 4 * counts[near] * step_hz)
+        rotation = speed, both
+    return Banded(
+        np.ascontiguousarray((np.add.reduceat(power * w[:, None], edges) / np.add.reduceat(power, edges)).T),
+        np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0),
+        spectra,
+        total,
+        rotation,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +102,7 @@ class PairReading:
     # Logarithm of the second's gain over the first's, and its standard error.
     log_gain: float
     log_gain_error: float
-    polarity: int  # -1 if one of them is reversed
+    polarity: float  # -1 if one of them is reversed
     # Delay of the second, and its standard error.
     delay_s: float
     delay_error_s: float
@@ -96,8 +114,16 @@ class PairReading:
     @property
     def transfer(self) -> ComplexArray:
         """Transfer function from z to v in each band."""
-        phase = self.lead_rad_s / self.bands.w - self.bands.w * self.delay_s
-        return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
+        return _transfer_of(self.bands.w, self.polarity, self.log_gain, self.delay_s, self.lead_rad_s)
+
+
+_Number = float | FloatArray
+
+
+def _transfer_of(
+    w: FloatArray, polarity: _Number, log_gain: _Number, delay_s: _Number, lead_rad_s: float = 0.0
+) -> ComplexArray:
+    return np.asarray(polarity * np.exp(log_gain + 1j * (lead_rad_s / w - w * delay_s)), dtype=np.complex128)
 
 
 def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
@@ -106,183 +132,222 @@ def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
     return [places.index(place) for place in dict.fromkeys(places) if place != places[pair.first]]
 
 
-def same(bands: Banded) -> float:
+def same(bands: Banded) -> FloatArray:
     """Part of the motion that two sensors show with equal timing, size and sense; 1 if all, negative if opposed."""
     z, v, cross = _powers_over_frequency(bands)
-    return float(2 * cross.sum().real / (z + v)) if z > 0 and v > 0 else 0.0
+    shown = 2 * cross.sum(axis=-1).real / np.maximum(z + v, np.finfo(float).tiny)
+    return np.asarray(np.where((z > 0) & (v > 0), shown, 0.0), dtype=np.float64)
 
 
-def _powers_over_frequency(bands: Banded) -> tuple[float, float, ComplexArray]:
+def _powers_over_frequency(bands: Banded) -> tuple[FloatArray, FloatArray, ComplexArray]:
     """Powers of z and v, and cross-powers per band, over ω: amplifies neither's noise at an end of the band."""
-    z, v = bands.total[:, 0, 0].real / bands.w, bands.total[:, 1, 1].real / bands.w
-    return float(z.sum()), float(v.sum()), np.asarray(bands.total[:, 1, 0] / bands.w, dtype=np.complex128)
+    over = bands.total / bands.w[..., None, None]
+    return over[..., 0, 0].real.sum(axis=-1), over[..., 1, 1].real.sum(axis=-1), over[..., 1, 0]
 
 
-def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
-    """Delay that brings the cross-powers into phase, and their sum then; negative if one sensor is reversed."""
+def _turned(w: FloatArray, cross: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Delays that bring cross-powers into phase, and their sums then; negative if one sensor is reversed.
+
+    Both are of shape (n_pairs,), of cross-powers of shape (n_pairs, n_bands).
+    """
     reach = round(LONGEST_DELAY_S / _DELAY_STEP_S)
     delays = _DELAY_STEP_S * np.arange(-reach, reach + 1)
-    turns = np.cumprod(np.broadcast_to(np.exp(1j * _DELAY_STEP_S * w), (reach, w.size)), axis=0)
-    sums = np.real(np.concatenate([turns[::-1].conj() @ cross, [cross.sum()], turns @ cross]))
-    good = np.flatnonzero(np.abs(sums) >= _AS_GOOD * np.abs(sums).max())
-    best = int(good[np.argmin(np.abs(delays[good]))])
+    turns = np.cumprod(np.broadcast_to(np.exp(1j * _DELAY_STEP_S * w)[:, None], (len(w), reach, w.shape[1])), axis=1)
+    at_once, later = cross.sum(axis=1, keepdims=True), turns @ cross[:, :, None]
+    sums = np.concatenate([(turns[:, ::-1].conj() @ cross[:, :, None])[:, :, 0], at_once, later[:, :, 0]], axis=1).real
+    sizes = np.abs(sums)
+    good = sizes >= _AS_GOOD * sizes.max(axis=1, keepdims=True)
+    found = np.where(good, np.abs(delays), np.inf).argmin(axis=1)
     # Climb to the peak from there: the shortest delay that fits well enough lies on its slope.
-    while 0 < best < delays.size - 1 and np.abs(sums[best - 1 : best + 2]).argmax() != 1:
-        best += int(np.abs(sums[best - 1 : best + 2]).argmax()) - 1
-    return float(delays[best]), float(sums[best])
+    for pair, own in enumerate(sizes):
+        while 0 < found[pair] < delays.size - 1 and own[found[pair] - 1 : found[pair] + 2].argmax() != 1:
+            found[pair] += own[found[pair] - 1 : found[pair] + 2].argmax() - 1
+    return delays[found], sums[np.arange(len(found)), found]
 
 
-def read_pair(
-    window: WindowStatistics, pair: MotionPair, bands: Banded, lead_rad_s: float | None = None
-) -> PairReading | None:
-    """Compare two sensors of one motion, from their banded spectra; None if either does not fluctuate.
+def read_pairs(
+    window: WindowStatistics, pairs: Sequence[MotionPair], bands: Banded, leads: Sequence[float | None]
+) -> list[PairReading]:
+    """Compare the two sensors of every motion, from their banded spectra; without motions that do not fluctuate.
 
-    `lead_rad_s` is the lead of the healthy pair; if None, it is estimated from the window.
+    `leads` are the leads of the healthy pairs, rad/s; where None, it is estimated from the window.
     """
-    z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
-    if not (np.all(z > 0) and np.all(v > 0)):
-        return None
-    incoherent = np.maximum(1 - np.abs(bands.spectra[:, 1, 0]) ** 2 / (z * v), _FLOOR)
+    alive = np.flatnonzero((np.einsum("pbii->pbi", bands.spectra[:, :, :2, :2]).real > 0).all(axis=(1, 2))).tolist()
+    if not alive:
+        return []
+    bands, pairs, leads = bands.of(alive), [pairs[at] for at in alive], [leads[at] for at in alive]
+    z, v = bands.spectra[:, :, 0, 0].real, bands.spectra[:, :, 1, 1].real
+    incoherent = np.maximum(1 - np.abs(bands.spectra[:, :, 1, 0]) ** 2 / (z * v), _FLOOR)
     h, variance, bias = _transfer(bands, incoherent)
     level, other, cross = _powers_over_frequency(bands)
     delay_s, total = _turned(bands.w, cross)
-    polarity, log_gain = 1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR)))
-    shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
-    states = window.states[pair.first], window.states[pair.second]
-    fitted = partial(_fitted, PairReading(pair, *states, bands, log_gain, 0.0, polarity, delay_s, 0.0, shared))
+    polarity, log_gain = np.where(total >= 0, 1.0, -1.0), np.log(np.maximum(np.abs(total) / level, _FLOOR))
+    shared = np.minimum(1.0, np.abs(total) / (np.sqrt(level) * np.sqrt(other)))
+    fitted = partial(_fitted, (polarity, log_gain, delay_s))
     alone = fitted(bands.w, h, variance, bias)
-    across = _across(alone, _other_plane(window, pair, bands), h, variance)
-    if across is not None:
-        part, widening = across
-        h, variance = h - part, variance * widening**2
+    h, variance, corrected = _without_across(window.states, pairs, bands, polarity, alone, h, variance)
+    alone = fitted(bands.w, h, variance, bias) if corrected else alone
+    given = [np.nan if lead is None else lead for lead in leads]
+    lead_rad_s = np.where(np.isnan(given), _lead(bands.w, polarity, alone, h, variance), given)
+    if lead_rad_s.any():
+        h = h * np.exp(-1j * lead_rad_s[:, None] / bands.w)
         alone = fitted(bands.w, h, variance, bias)
-    lead_rad_s = _lead(alone, h, variance) if lead_rad_s is None else lead_rad_s
-    if lead_rad_s:
-        h = h * np.exp(-1j * lead_rad_s / bands.w)
-        alone = fitted(bands.w, h, variance, bias)
-    line = _transfer_at_1x(window, bands, incoherent)
-    if line is None:
-        return replace(alone, lead_rad_s=lead_rad_s)
-    speed, ratio, spread = line
-    ratio *= complex(np.exp(-1j * lead_rad_s / speed))
-    found = fitted(np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0))
-    foreign = abs(found.log_gain - alone.log_gain) > max(_MOST_LINE_ERRORS * alone.log_gain_error, _RUNOUT)
-    foreign |= abs(found.delay_s - alone.delay_s) > _MOST_LINE_ERRORS * alone.delay_error_s
-    return replace(alone if foreign and alone.log_gain_error < _RUNOUT else found, lead_rad_s=lead_rad_s)
+    found, line = alone, _transfer_at_1x(window, bands, incoherent)
+    if line is not None:
+        there, speed, ratio, spread = line
+        w = np.append(bands.w, np.full((len(pairs), 1), speed), axis=1)
+        turned = np.append(h, (ratio * np.exp(-1j * lead_rad_s / speed))[:, None], axis=1)
+        both = fitted(w, turned, np.append(variance, spread[:, None], axis=1), np.pad(bias, ((0, 0), (0, 1))))
+        foreign = np.abs(both[0] - alone[0]) > np.maximum(_MOST_LINE_ERRORS * alone[1], _RUNOUT)
+        foreign |= np.abs(both[2] - alone[2]) > _MOST_LINE_ERRORS * alone[3]
+        found = np.where(~there | (foreign & (alone[1] < _RUNOUT)), alone, both)
+    figures = np.stack([*found[:2], polarity, *found[2:], shared, lead_rad_s], axis=1).tolist()
+    return [
+        PairReading(pair, window.states[pair.first], window.states[pair.second], bands.of(at), *own)
+        for at, (pair, own) in enumerate(zip(pairs, figures, strict=True))
+    ]
 
 
-def _fitted(start: PairReading, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray) -> PairReading:
-    """Weighted least-squares fit of gain and delay to the transfer functions of all bands, from a first guess."""
-    log_gain, delay_s, weight = start.log_gain, start.delay_s, 1 / variance
-    y, jw, total, by_delay = h * start.polarity, 1j * w, float(weight.sum()), weight * w
-    moment, right_way = float(by_delay @ w), y
+def _fitted(
+    start: tuple[FloatArray, FloatArray, FloatArray], w: FloatArray, h: ComplexArray, *errors: FloatArray
+) -> FloatArray:
+    """Weighted least-squares fits of gain and delay to the transfer functions of all bands, from a first guess.
+
+    `start` are polarities, log gains and delays, `errors` the transfer functions' variances and biases. Returns log
+    gains and delays, each followed by their standard errors, shape (4, n_pairs).
+    """
+    (polarity, log_gain, delay_s), (variance, bias) = (one[:, None] for one in start), errors
+    weight, jw, right_way = 1 / variance, 1j * w, h * polarity
+    total, by_delay = weight.sum(axis=1, keepdims=True), weight * w
+    moment, y = (by_delay * w).sum(axis=1, keepdims=True), right_way
     for _ in range(4):
         y = right_way * np.exp(jw * delay_s - log_gain) - 1
-        log_gain += math.log1p(min(max(float(weight @ y.real) / total, -0.5), 1.0))
-        delay_s -= min(max(float(by_delay @ y.imag) / moment, -1e-3), 1e-3)
-    freedom = max(1, y.size - 1)
-    scatter_gain = max(1.0, float(weight @ y.real**2) * 2 / freedom)
-    scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
-    gain_error = math.sqrt(scatter_gain / (2 * total)) + float(weight @ bias) / total
-    delay_error_s = math.sqrt(scatter_delay / (2 * moment))
-    return replace(start, log_gain=log_gain, log_gain_error=gain_error, delay_s=delay_s, delay_error_s=delay_error_s)
+        too_large = (weight * y.real).sum(axis=1, keepdims=True) / total
+        log_gain = log_gain + np.log1p(np.minimum(np.maximum(too_large, -0.5), 1.0))
+        early = (by_delay * y.imag).sum(axis=1, keepdims=True) / moment
+        delay_s = delay_s - np.minimum(np.maximum(early, -1e-3), 1e-3)
+    scatter = np.stack([y.real, y.imag]) ** 2
+    scatter = np.maximum(1.0, (weight * scatter).sum(axis=2) * 2 / max(1, y.shape[1] - 1))
+    total, moment, by_bias = total[:, 0], moment[:, 0], (weight * bias).sum(axis=1)
+    gain_error, delay_error_s = np.sqrt(scatter[0] / (2 * total)) + by_bias / total, np.sqrt(scatter[1] / (2 * moment))
+    return np.stack([log_gain[:, 0], gain_error, delay_s[:, 0], delay_error_s])
 
 
-def _other_plane(window: WindowStatistics, pair: MotionPair, bands: Banded) -> ComplexArray | None:
-    """Transfer function from z to the same place's motion in the other plane, (n_bands,); None if not measured."""
-    others = _others(window.states, pair)
-    own, _, order = window.states[pair.second].partition("_")
-    for at, column in enumerate(others, 2):
-        place, _, other_order = window.states[column].partition("_")
+@lru_cache(maxsize=64)
+def _other_plane(states: tuple[str, ...], pair: MotionPair) -> tuple[int, int]:
+    """Where a pair's bands have the same place's motion in the other plane; 0 if not measured.
+
+    With it comes by how many derivatives the pair's second sensor is ahead of that.
+    """
+    own, _, order = states[pair.second].partition("_")
+    for at, column in enumerate(_others(states, pair), 2):
+        place, _, other_order = states[column].partition("_")
         if place == own.translate(_PLANES):
-            rates = _RATES[order] - _RATES[other_order]
-            moved = bands.spectra[:, at, 0] / bands.spectra[:, 0, 0].real
-            return np.asarray(moved * (1j * bands.w) ** rates, dtype=np.complex128)
-    return None
+            return at, _RATES[order] - _RATES[other_order]
+    return 0, 0
 
 
-def _across(
-    alone: PairReading, other: ComplexArray | None, h: ComplexArray, variance: FloatArray
-) -> tuple[ComplexArray, float] | None:
-    """Contribution of the other plane to the transfer function; None unless it fits beyond gain, delay and lead.
+def _without_across(
+    states: tuple[str, ...],
+    pairs: Sequence[MotionPair],
+    bands: Banded,
+    polarity: FloatArray,
+    alone: FloatArray,
+    h: ComplexArray,
+    variance: FloatArray,
+) -> tuple[ComplexArray, FloatArray, bool]:
+    """Transfer functions less what the other plane contributes, if that fits beyond gain, delay and lead.
 
-    With it comes the factor by which not knowing its size widens the errors of gain and delay, whichever is wider.
+    Their variances grow as not knowing its size widens the errors of gain and delay, whichever is wider. Last comes
+    whether any was corrected.
 
     A sensor that is mounted at an angle or sensitive across its axis shows a small part of the other plane's motion. If
     one force moves both planes, that part distorts the transfer, most at frequencies where the sensor's own plane
     hardly moves, and would be mistaken for a gain or a delay.
     """
-    if other is None or not other.any():  # a stuck sensor of the other plane gives zeros
-        return None
-    w, expected = alone.bands.w, alone.transfer
-    aim, seen = h / expected - 1, other / expected
-    weight = np.tile(np.sqrt(2 / variance), 2)
-    sides = [np.ones_like(h), 1j * w, 1j / w, seen]
-    design = np.stack([np.concatenate([one.real, one.imag]) for one in sides], axis=1) * weight[:, None]
-    design /= (lengths := np.linalg.norm(design, axis=0))
-    y = np.concatenate([aim.real, aim.imag]) * weight
+    column, rates = np.array([_other_plane(states, pair) for pair in pairs]).T
+    other = bands.spectra[np.arange(len(pairs)), :, column, 0] / bands.spectra[:, :, 0, 0].real
+    other = other * (1j * bands.w) ** rates[:, None]
+    tried = np.flatnonzero((column > 0) & other.any(axis=1))  # a stuck sensor of the other plane gives zeros
+    if not tried.size:
+        return h, variance, False
+    other, w = other[tried], bands.w[tried]
+    expected = _transfer_of(w, polarity[tried, None], alone[0, tried, None], alone[2, tried, None])
+    aim, seen, weight = h[tried] / expected - 1, other / expected, np.sqrt(2 / variance[tried])
+    sides = np.stack([np.ones_like(seen), 1j * w, 1j / w, seen], axis=2) * weight[:, :, None]
+    design, y = (
+        np.concatenate([sides.real, sides.imag], axis=1),
+        np.append(aim.real * weight, aim.imag * weight, axis=1),
+    )
+    design /= (lengths := np.linalg.norm(design, axis=1, keepdims=True))
     directions, triangle = np.linalg.qr(design)
-    along = directions.T @ y
-    left = y - directions @ along
-    if not along[-1] ** 2 > _TOLD_APART * max(1.0, float(left @ left) / max(1, y.size - design.shape[1])):
-        return None
-    size = float(along[-1] / triangle[-1, -1] / lengths[-1])
-    if not abs(size) < _MOST_ACROSS:
-        return None
-    inverse = np.linalg.inv(np.linalg.qr(design[:, [0, 1, 3]], mode="r"))  # of gain, delay and the other plane
-    return np.asarray(size * other, dtype=np.complex128), float(np.linalg.norm(inverse[:2], axis=1).max())
+    along = directions.swapaxes(1, 2) @ y[:, :, None]
+    left = y - (directions @ along)[:, :, 0]
+    scatter = np.maximum(1.0, (left**2).sum(axis=1) / max(1, y.shape[1] - design.shape[2]))
+    size = along[:, -1, 0] / triangle[:, -1, -1] / lengths[:, 0, -1]
+    fits = (along[:, -1, 0] ** 2 > _TOLD_APART * scatter) & (np.abs(size) < _MOST_ACROSS)
+    if not fits.any():
+        return h, variance, False
+    h, variance = h.copy(), variance.copy()
+    h[tried[fits]] -= (size[:, None] * other)[fits]
+    inverse = np.linalg.inv(np.linalg.qr(design[fits][:, :, [0, 1, 3]], mode="r"))  # of gain, delay, the other plane
+    variance[tried[fits]] *= (inverse[:, :2] ** 2).sum(axis=2).max(axis=1)[:, None]
+    return h, variance, True
 
 
-def _lead(alone: PairReading, h: ComplexArray, variance: FloatArray) -> float:
+def _lead(w: FloatArray, polarity: FloatArray, alone: FloatArray, h: ComplexArray, variance: FloatArray) -> FloatArray:
     """Phase lead of the second times w; 0 unless it explains the phases of all bands better than a delay."""
-    w, weight, ahead = alone.bands.w, 2 / variance, np.angle(alone.polarity * h)
-    lead_rad_s = float(weight @ (ahead / w) / (weight @ w**-2.0))
-    late = np.angle(h / alone.transfer)
-    as_delay, as_lead = (float(weight @ left**2) for left in (late, ahead - lead_rad_s / w))
-    scatter = max(1.0, as_lead / max(1, w.size - 1))
-    return lead_rad_s if as_delay - as_lead > _TOLD_APART * scatter else 0.0
+    weight, ahead = 2 / variance, np.angle(np.asarray(polarity[:, None] * h))
+    lead_rad_s = (weight * ahead / w).sum(axis=1) / (weight * w**-2.0).sum(axis=1)
+    late = np.angle(h / _transfer_of(w, polarity[:, None], alone[0, :, None], alone[2, :, None]))
+    as_delay, as_lead = ((weight * left**2).sum(axis=1) for left in (late, ahead - lead_rad_s[:, None] / w))
+    scatter = np.maximum(1.0, as_lead / max(1, w.shape[1] - 1))
+    return np.where(as_delay - as_lead > _TOLD_APART * scatter, lead_rad_s, 0.0)
 
 
 def _transfer_at_1x(
     window: WindowStatistics, bands: Banded, incoherent: FloatArray
-) -> tuple[float, complex, float] | None:
-    """Speed, and transfer at 1x with its relative variance, from the 1x vectors; None if z has no 1x power."""
+) -> tuple[BoolArray, float, ComplexArray, FloatArray] | None:
+    """Where z has 1x power, the speed, and the transfer at 1x with its relative variance; None without 1x vectors."""
     if bands.rotation is None:
         return None
     speed, vectors = bands.rotation
-    power = float(np.sum(np.abs(vectors[:, 0]) ** 2))
-    if not (power > 0 and np.isfinite(power)):
-        return None
-    ratio = complex(np.sum(vectors[:, 0].conj() * vectors[:, 1]) / power)
-    near = int(np.argmin(np.abs(bands.w - speed)))
-    noise = incoherent[near] * bands.spectra[near, 0, 0].real
-    return speed, ratio, float(4 * noise * len(vectors) / (window.duration_s * power))
+    power = np.sum(np.abs(vectors[:, :, 0]) ** 2, axis=1)
+    there = (power > 0) & np.isfinite(power)
+    power = np.where(there, power, 1.0)
+    ratio = np.where(there, np.sum(vectors[:, :, 0].conj() * vectors[:, :, 1], axis=1) / power, 1.0)
+    near = np.arange(len(power)), np.abs(bands.w - speed).argmin(axis=1)
+    noise = incoherent[near] * bands.spectra[:, :, 0, 0].real[near]
+    return there, speed, ratio, 4 * noise * vectors.shape[1] / (window.duration_s * power)
 
 
 def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """Transfer from z to v in each band, its relative variance, and the largest bias of its logarithm by noise."""
     S = bands.spectra
-    z, v, cross = S[:, 0, 0].real, S[:, 1, 1].real, S[:, 1, 0]
-    bracketed = np.sqrt(v / z) * cross / np.maximum(np.abs(cross), _FLOOR * np.sqrt(z * v))
+    z, v, cross, n = S[:, :, 0, 0].real, S[:, :, 1, 1].real, S[:, :, 1, 0], S.shape[-1]
     half = -0.5 * np.log(1 - np.minimum(incoherent, 1 - 1e-6))
     variance = incoherent / np.maximum(1 - incoherent, 1e-6) / bands.averages
-    if S.shape[1] == 2:
-        return bracketed, variance, half
-    scale = 1 / np.sqrt(np.maximum(np.einsum("bii->bi", S).real, np.finfo(float).tiny))
-    unit = S * scale[:, :, None] * scale[:, None, :]
-    others = unit[:, 2:, 2:] + 1e-9 * np.eye(S.shape[1] - 2)
-    a = np.linalg.solve(others, unit[:, 2:, :1])[:, :, 0]  # prediction of z from the other places: z = aᴴ w
-    seen = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 0]).real
-    own = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 1])
-    overfit = (S.shape[1] - 2) / bands.averages  # part that the others would explain of pure noise
+    if n == 2:
+        return np.sqrt(v / z) * cross / np.maximum(np.abs(cross), _FLOOR * np.sqrt(z * v)), variance, half
+    scale = 1 / np.sqrt(np.maximum(np.einsum("pbii->pbi", S).real, np.finfo(float).tiny))
+    unit = S * scale[..., None] * scale[:, :, None]
+    others = unit[:, :, 2:, 2:] + 1e-9 * np.eye(n - 2)
+    a = (
+        np.linalg.solve(others, unit[:, :, 2:, :1]).conj().swapaxes(2, 3)
+    )  # prediction of z by the other places, z = a w
+    seen, own = (a @ unit[:, :, 2:, :2])[:, :, 0].transpose(2, 0, 1)
+    seen = seen.real
+    overfit = (n - 2) / bands.averages  # part that the others would explain of pure noise
     explained = np.clip((seen - overfit) / (1 - np.minimum(overfit, 0.9)), 1e-6, 1.0)
-    h = (own.conj() / np.maximum(seen, _FLOOR)) * scale[:, 0] / scale[:, 1]
+    h = (own.conj() / np.maximum(seen, _FLOOR)) * scale[:, :, 0] / scale[:, :, 1]
     left = np.minimum(half * overfit / np.maximum(seen, _FLOOR), half)
     return h, variance / explained, left
 
 
-def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Relative deviation of the pair's gain from its median, hop by hop, and each hop's standard error, in two ways.
+def gain_courses(window: WindowStatistics, readings: Sequence[PairReading]) -> tuple[FloatArray, FloatArray]:
+    """Relative deviation of the pairs' gains from their medians, hop by hop, and its standard error, in two ways.
+
+    Both are of shape (2, n_pairs, n_hops).
 
     Sensor noise is constant while the motion varies: its share of the signal grows as a machine runs down and shrinks
     when a line appears. The ratio of such a hop is biased accordingly, so its standard error is increased. Bands that
@@ -293,19 +358,27 @@ def gain_courses(window: WindowStatistics, reading: PairReading) -> tuple[tuple[
 
     Bands through which the 1x passes as the speed changes do not count, nor do hops of unknown speed among others.
     """
-    bands, number = reading.bands, motion_pairs(window.states).index(reading.pair)
-    z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
-    incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
-    aligned = reading.transfer.conj() / np.exp(reading.log_gain)
-    powers = np.stack([hop[number] for hop in window.pair_powers])
-    common = np.real(aligned * powers[:, :, 1])
-    counts = ~_passed_by_1x(window)
-    common, powers, averages = common[:, counts], powers[:, counts], bands.averages[counts] / len(powers)
-    rises, error = _course(common, powers[:, :, 0].real, incoherent[counts], averages)
-    falls, other_error = _course(common, powers[:, :, 2].real, incoherent[counts], averages)
+    total = np.stack([one.bands.total for one in readings])
+    z, v = total[:, :, 0, 0].real, total[:, :, 1, 1].real
+    incoherent = np.maximum(1 - np.abs(total[:, :, 1, 0]) ** 2 / (z * v), _FLOOR)
+    aligned = np.stack([one.transfer.conj() / np.exp(one.log_gain) for one in readings])
+    every, counts = motion_pairs(window.states), ~_passed_by_1x(window)
+    at = [every.index(one.pair) for one in readings]
+    powers = np.stack([hop[at] for hop in window.pair_powers], axis=1)[:, :, counts]
+    own = np.maximum(powers[..., ::2].real.transpose(3, 0, 1, 2), np.finfo(float).tiny)
+    ratio = np.real(aligned[:, None, counts] * powers[..., 1]) / own
+    noise = np.minimum(incoherent[:, None, counts] * own.mean(axis=2, keepdims=True) / own, 1.0)
+    kept = np.maximum(1 - noise, 1e-6)
+    variance = noise / kept / (readings[0].bands.averages[counts] / powers.shape[1])
+    # Each band about its own median: noise lowers the ratio equally in all hops of equal level.
+    usual, usual_variance, usual_kept = np.median(np.stack([ratio, variance, kept]), axis=3, keepdims=True)
+    weight = 1 / np.maximum(variance, usual_variance)
+    weight /= (precision := weight.sum(axis=3, keepdims=True))
+    course = np.sum(weight * (ratio / usual - 1), axis=3) * [[[1]], [[-1]]]
+    by_noise = np.sum(weight * (kept / usual_kept - 1), axis=3)
     known = np.isfinite(window.hop_speed_rad_s)
     unsure = np.where(known | ~known.any(), 1.0, _UNSURE)
-    return (rises, error * unsure), (-falls, other_error * unsure)
+    return course, np.sqrt(1 / (2 * precision[..., 0]) + by_noise**2) * unsure
 
 
 def _passed_by_1x(window: WindowStatistics) -> BoolArray:
@@ -321,24 +394,6 @@ def _passed_by_1x(window: WindowStatistics) -> BoolArray:
     below = first_hz < speeds_hz.max() + _LEAKS * step_hz
     passed = below & (np.append(first_hz[1:], np.inf) > speeds_hz.min() - _LEAKS * step_hz)
     return np.asarray(passed & ~passed.all(), dtype=np.bool_)
-
-
-def _course(
-    common: FloatArray, power: FloatArray, incoherent: FloatArray, averages: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Relative deviation of a ratio of powers, each (n_hops, n_bands), averaged over the bands; its standard error."""
-    own = np.maximum(power, np.finfo(float).tiny)
-    ratio = common / own
-    # Each band about its own median: noise lowers the ratio equally in all hops of equal level.
-    course = ratio / np.median(ratio, axis=0) - 1
-    noise = np.minimum(incoherent * own.mean(axis=0) / own, 1.0)
-    kept = np.maximum(1 - noise, 1e-6)
-    variance = noise / kept / averages
-    weight = 1 / np.maximum(variance, np.median(variance, axis=0))
-    total = weight.sum(axis=1)
-    by_noise = np.sum(weight * (kept / np.median(kept, axis=0) - 1), axis=1) / total
-    error = np.sqrt(1 / (2 * total) + by_noise**2)
-    return np.asarray(np.sum(course * weight, axis=1) / total, dtype=np.float64), np.asarray(error, dtype=np.float64)
 
 
 def delay_course(window: WindowStatistics, reading: PairReading) -> tuple[FloatArray, FloatArray]:

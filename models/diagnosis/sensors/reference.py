@@ -13,7 +13,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
-from models.diagnosis.sensors.kinematics import Banded, PairReading, read_pair, same
+from models.diagnosis.sensors.kinematics import PairReading, banded, read_pairs, same
 from models.diagnosis.window.motion import motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
@@ -272,15 +272,13 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
     states = windows[0].states
     pairs = []
     for pair in motion_pairs(states):
-        bands = [Banded(window, pair) for window in windows]
-        readings = [read_pair(window, pair, own) for window, own in zip(windows, bands, strict=True)]
-        there = [reading for reading in readings if reading is not None]
-        if len(there) < len(readings):
+        bands = [(window, [pair], banded(window, [pair])) for window in windows]
+        there = [one for each in bands for one in read_pairs(*each, [None])]
+        if len(there) < len(windows):
             raise EstimationError(f"no fluctuation in {states[pair.first]} or {states[pair.second]}")
         lead_rad_s = float(np.median([one.lead_rad_s for one in there]))
         if any(one.lead_rad_s for one in there):
-            again = [read_pair(window, pair, own, lead_rad_s) for window, own in zip(windows, bands, strict=True)]
-            there = [one for one in again if one is not None]
+            there = [one for each in bands for one in read_pairs(*each, [lead_rad_s])]
         noises = [PairNoise(window, one) for window, one in zip(windows, there, strict=True)]
         pairs.append(_pair(there, _noise([(one.noise, one.noise / one.scale) for one in noises])))
     noise = {
@@ -344,7 +342,7 @@ def _pair(readings: list[PairReading], noise: NoiseReference | None) -> PairRefe
         delay_spread_s=_spread(delays, delay_errors),
         lead_rad_s=readings[0].lead_rad_s,
         shared=min(reading.shared for reading in readings),
-        same=min(same(reading.bands) for reading in readings),
+        same=float(min(same(reading.bands) for reading in readings)),
         noise=noise,
     )
 
