@@ -102,19 +102,14 @@ class Equation:
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, SI units."""
+        index, terms = {name: position for position, name in enumerate(view.states)}, (*self.inputs, self.target)
+        references = [[index[f"{one}_dot" if term.rate_reference else one] for term in terms] for one in _REFERENCES]
+        rows = view.correlation[..., references, [index[term.response] for term in terms]]
+        rows = rows.reshape(*rows.shape[:-3], -1, len(terms))  # lags, and references for each
         speed_ratio = view.speed_rad_s / machine.operation.speed_rad_s
-        index = {name: position for position, name in enumerate(view.states)}
-        references = [index[name] for name in _REFERENCES]
-        rates = [index[f"{name}_dot"] for name in _REFERENCES]
-
-        def values(term: Term) -> FloatArray:
-            rows = view.correlation[..., rates if term.rate_reference else references, index[term.response]]
-            rows = rows.reshape(*rows.shape[:-2], -1)
-            return rows * speed_ratio if term.times_speed else rows
-
-        inputs = np.stack([values(term) for term in self.inputs], axis=-1)
+        rows *= [speed_ratio if term.times_speed else 1.0 for term in terms]
         coefficients = np.array([function(machine.rotor) for function in self.signatures.values()])
-        return EquationRows(inputs, values(self.target), inputs @ coefficients.T)
+        return EquationRows(rows[..., :-1], rows[..., -1], rows[..., :-1] @ coefficients.T)
 
 
 @dataclass(frozen=True, slots=True)

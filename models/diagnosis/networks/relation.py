@@ -3,20 +3,13 @@
 Training needs torch, evaluation does not: the monitor starts without it and gives the same numbers everywhere.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from models.diagnosis.networks.equations import (
-    EQUATIONS,
-    Equation,
-    EquationRows,
-    StatisticsView,
-    SynchronousEquation,
-    missing,
-)
+from models.diagnosis.networks.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
 from models.diagnosis.readings import Diagnosis, no_reading, possible_reading
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
@@ -74,19 +67,24 @@ class EquationNetwork:
 
 
 def window_view(window: WindowStatistics, machine: Machine, *, by_hop: bool = False) -> StatisticsView:
-    """Statistics of the window that equations need, or those of each hop, along the first axis.
+    """Statistics of the window that equations need; `by_hop`, and then those of each hop, along the first axis.
 
     Lags start at ``lag_from_s``, because shorter ones contain the excitation itself.
     """
     first = int(np.searchsorted(window.lags_s, machine.window.lag_from_s - 1e-9))
     speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
+    correlation, synchronous = window.correlation[first:], window.synchronous
     if by_hop:
-        return StatisticsView(window.states, window.hop_correlation[:, first:], window.hop_synchronous, speed)
-    return StatisticsView(window.states, window.correlation[first:], window.synchronous, speed)
+        correlation = np.concatenate([correlation[np.newaxis], window.hop_correlation[:, first:]])
+        vectors = window.hop_synchronous
+        synchronous = None if synchronous is None or vectors is None else np.vstack([synchronous, vectors])
+    return StatisticsView(window.states, correlation, synchronous, speed)
 
 
-def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: Machine) -> EquationReading:
-    """Evaluate one equation on one window.
+def read_equation(
+    trained: EquationNetwork, window: WindowStatistics, machine: Machine, view: StatisticsView | None = None
+) -> EquationReading:
+    """Evaluate one equation on one window, whose `view` by hops may be known already.
 
     The residual is projected on the signatures of the equation's own parameters: this detects a change, assigns it to a
     parameter and sizes it in one step. The standard error comes from the scatter over the window's hops and, from the
@@ -96,15 +94,13 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
     if absent:
         return not_read(equation, f"not measured: {', '.join(absent)}")
-    rows = equation.rows(window_view(window, machine), machine)
-    norm = rows.norm
+    rows = equation.rows(view or window_view(window, machine, by_hop=True), machine)
+    norm = replace(rows, target=rows.target[0]).norm
     if not norm > 0:
         return not_read(equation, "the target correlation is zero")
-    residual = _residual(trained.network, rows, norm)
-    projection = np.linalg.pinv(rows.signatures / norm)
-    change = projection @ residual
-    by_hop = equation.rows(window_view(window, machine, by_hop=True), machine)
-    hops = _residual(trained.network, by_hop, norm) @ projection.T
+    residuals = rows.target / norm - trained.network(rows.inputs / norm)
+    projection = np.linalg.pinv(rows.signatures[0] / norm)
+    change, hops = projection @ residuals[0], residuals[1:] @ projection.T
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
@@ -115,14 +111,10 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
         equation=equation.number,
         title=equation.title,
         evaluable=True,
-        msd=float(np.mean(residual**2)),
+        msd=float(np.mean(residuals[0] ** 2)),
         msd_healthy=None if healthy is None else healthy.msd,
         parameters=tuple(possible_reading(name, "relation", value, spread) for name, value, spread in readings),
     )
-
-
-def _residual(network: Network, rows: EquationRows, norm: float) -> FloatArray:
-    return np.asarray(rows.target / norm - network(rows.inputs / norm), dtype=np.float64)
 
 
 def equation_by_number(number: str) -> Equation | SynchronousEquation:
@@ -159,10 +151,11 @@ class RelationDiagnostician:
         """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
         equations: list[EquationReading] = []
         parameters: list[Parameter] = []
+        view = window_view(window, self._machine, by_hop=True)
         for equation in EQUATIONS:
             trained, reading = self._networks.get(equation.number), not_read(equation, "no trained network")
             if trained is not None:
-                reading = read_equation(trained, window, self._machine)
+                reading = read_equation(trained, window, self._machine, view)
             equations.append(reading)
             parameters += reading.parameters or [
                 no_reading(name, self.by, reading.reason) for name in equation.parameters
