@@ -1,7 +1,7 @@
 """Fisher scoring: the search for the maximum of one window's Whittle likelihood."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -149,7 +149,7 @@ class FisherScoring:
         value, whitened = self._value(theta)
         if whitened is None:
             raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
-        gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened, derivatives)
+        gradient, information, on_levels, reached = self._scores(theta, whitened, derivatives)
         while True:
             covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
@@ -160,10 +160,11 @@ class FisherScoring:
                 if not model.shapes or looks == _LOOKS or not self._learn_strengths(theta, covariance):
                     break
                 looks += 1
-                value, whitened = self._value(theta)
-                if whitened is None:
-                    raise AssertionError("a point that made a valid spectrum still makes one")
-                gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened)
+                value, _ = self._value(theta, whitened)
+                # At the same point, unless an earlier search's derivatives are of another speed.
+                gradient, information, on_levels, reached = self._scores(
+                    theta, whitened, None if reached is derivatives else reached
+                )
                 continue
             steps += 1
             damped = information + damping * np.diag(np.diag(information))
@@ -171,12 +172,12 @@ class FisherScoring:
             trial_value, trial_whitened = self._value(trial)
             if trial_whitened is not None and trial_value > value:
                 theta, value, whitened = trial, trial_value, trial_whitened
-                gradient, information, slopes, on_levels, slopes_rad_s = self._scores(theta, whitened)
+                gradient, information, on_levels, reached = self._scores(theta, whitened)
                 damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
         fitted = model.size - float(self.weights.ridge @ np.diag(covariance))
-        reached = Derivatives(slopes, on_levels - np.diag(self.weights.pull), slopes_rad_s)
+        reached = replace(reached, information=on_levels - np.diag(self.weights.pull))
         return Maximum(on_levels, reached, whitened, steps, fitted, full_step[diagnosed])
 
     def _learn_strengths(self, theta: FloatArray, covariance: FloatArray) -> bool:
@@ -198,9 +199,9 @@ class FisherScoring:
             changed |= bool(abs(np.log(new / old)) > _SAME_STRENGTH)
         return changed
 
-    def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
-        """Log-likelihood with the weak pulls, up to a constant, and the whitened spectra."""
-        whitened = whitened_at(self._model.at(theta, self._speed_rad_s), self._observed)
+    def _value(self, theta: FloatArray, whitened: Whitened | None = None) -> tuple[float, Whitened | None]:
+        """Log-likelihood with the weak pulls, up to a constant, and the whitened spectra, which may be known."""
+        whitened = whitened or whitened_at(self._model.at(theta, self._speed_rad_s), self._observed)
         if whitened is None:
             return -np.inf, None
         log_determinant = -2 * np.log(np.einsum("fii->fi", whitened.L_inverse).real).sum(axis=1)
@@ -210,26 +211,26 @@ class FisherScoring:
 
     def _scores(
         self, theta: FloatArray, whitened: Whitened, derivatives: Derivatives | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Speeds]:
-        """Gradient and information with respect to T, packed slopes, information with respect to C, slopes' speed."""
-        model, speed_rad_s = self._model, self._speed_rad_s
+    ) -> tuple[FloatArray, FloatArray, FloatArray, Derivatives]:
+        """Gradient and information with respect to T, information with respect to C, and the derivatives without pulls.
+
+        The derivatives may be known.
+        """
+        model = self._model
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
-            on_levels = information_of(slopes, self.weights, self._weighted)
-        else:
-            slopes, on_levels, speed_rad_s = derivatives.slopes, derivatives.information.copy(), derivatives.speed_rad_s
-        gradient = gradient_of(slopes, packed(whitened.excess), self.weights)
+            derivatives = Derivatives(slopes, information_of(slopes, self.weights, self._weighted), self._speed_rad_s)
+        gradient = gradient_of(derivatives.slopes, packed(whitened.excess), self.weights)
         levels = model.level_at
         chain = _levels_by_factor(model.factor(theta))
-        information = on_levels.copy()
+        information = derivatives.information.copy()
         information[levels] = chain.T @ information[levels]
         information[:, levels] = information[:, levels] @ chain
         information[levels, levels] += _curvature(gradient[levels])
         gradient[levels] = chain.T @ gradient[levels]
         gradient -= self.weights.ridge * (theta - self.weights.centre)
         information[np.diag_indices(model.size)] += self.weights.ridge
-        on_levels[np.diag_indices(model.size)] += self.weights.pull
-        return gradient, information, slopes, on_levels, speed_rad_s
+        return gradient, information, derivatives.information + np.diag(self.weights.pull), derivatives
 
 
 def gradient_of(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
