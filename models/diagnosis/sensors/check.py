@@ -73,11 +73,8 @@ def sensor_findings(
         bands = banded(window, pairs)
         exchanged, explained = swapped(window, dict(zip(pairs, same(bands).tolist(), strict=True)), naming, reference)
         findings += exchanged
-        there = [at for at, pair in enumerate(pairs) if pair not in explained]
-        names = [(window.states[pairs[at].first], window.states[pairs[at].second]) for at in there]
-        healthy = [None if reference is None else reference.pair(*each) for each in names]
-        leads = [None if one is None else one.lead_rad_s for one in healthy]
-        compared = read_pairs(window, [pairs[at] for at in there], bands.of(there), leads)
+        leads = {} if reference is None else {(one.first, one.second): one.lead_rad_s for one in reference.pairs}
+        compared = [one for one in read_pairs(window, pairs, bands, leads) if one.pair not in explained]
     readings: list[PairReading] = []
     for reading in compared:
         states = reading.first, reading.second

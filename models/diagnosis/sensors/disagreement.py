@@ -1,7 +1,7 @@
 """Two sensors of one motion that disagree: wrong gain or delay of one of them, or swapped channels."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
@@ -39,11 +39,7 @@ class _Departure:
     """Differences of a pair's reading from its reference or, without one, from perfect agreement."""
 
     def __init__(
-        self,
-        reading: PairReading,
-        reference: SensorReference | None,
-        course: FloatArray,
-        parts: Iterable[tuple[float, float]],
+        self, reading: PairReading, reference: SensorReference | None, course: FloatArray, parts: list[list[float]]
     ) -> None:
         known = None if reference is None else reference.pair(reading.first, reading.second)
         usual = known or PERFECT

@@ -9,7 +9,7 @@ high-pass the lead in phase falls as 1/frequency, whereas the lag of a delay gro
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from models.diagnosis.window.motion import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window.statistics import WindowStatistics
-from models.signals.block import BoolArray, ComplexArray, FloatArray
+from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray
 
 LONGEST_DELAY_S = 0.02  # longest delay searched for
 _DELAY_STEP_S = 2.5e-4
@@ -82,13 +82,9 @@ def banded(window: WindowStatistics, pairs: Sequence[MotionPair]) -> Banded:
         if near >= 0 and speed <= w[-1]:
             total[:, near] += both.swapaxes(1, 2) @ both.conj() / (both.shape[1] * 4 * counts[near] * step_hz)
         rotation = speed, both
-    return Banded(
-        np.ascontiguousarray((np.add.reduceat(power * w[:, None], edges) / np.add.reduceat(power, edges)).T),
-        np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0),
-        spectra,
-        total,
-        rotation,
-    )
+    centre = np.ascontiguousarray((np.add.reduceat(power * w[:, None], edges) / np.add.reduceat(power, edges)).T)
+    averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
+    return Banded(centre, averages, spectra, total, rotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,16 +110,14 @@ class PairReading:
     @property
     def transfer(self) -> ComplexArray:
         """Transfer function from z to v in each band."""
-        return _transfer_of(self.bands.w, self.polarity, self.log_gain, self.delay_s, self.lead_rad_s)
+        phase = self.lead_rad_s / self.bands.w - self.bands.w * self.delay_s
+        return np.asarray(self.polarity * np.exp(self.log_gain + 1j * phase), dtype=np.complex128)
 
 
-_Number = float | FloatArray
-
-
-def _transfer_of(
-    w: FloatArray, polarity: _Number, log_gain: _Number, delay_s: _Number, lead_rad_s: float = 0.0
-) -> ComplexArray:
-    return np.asarray(polarity * np.exp(log_gain + 1j * (lead_rad_s / w - w * delay_s)), dtype=np.complex128)
+def _transfer_of(w: FloatArray, *figures: FloatArray) -> ComplexArray:
+    """Transfer functions of pairs with these polarities, log gains and delays, shape (n_pairs, n_bands)."""
+    polarity, log_gain, delay_s = (one[:, None] for one in figures)
+    return np.asarray(polarity * np.exp(log_gain - 1j * w * delay_s), dtype=np.complex128)
 
 
 def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
@@ -166,16 +160,17 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[FloatArray, FloatArray]
 
 
 def read_pairs(
-    window: WindowStatistics, pairs: Sequence[MotionPair], bands: Banded, leads: Sequence[float | None]
+    window: WindowStatistics, pairs: Sequence[MotionPair], bands: Banded, leads: Mapping[tuple[str, str], float]
 ) -> list[PairReading]:
     """Compare the two sensors of every motion, from their banded spectra; without motions that do not fluctuate.
 
-    `leads` are the leads of the healthy pairs, rad/s; where None, it is estimated from the window.
+    `leads` are those of healthy pairs of states, rad/s; others are estimated from the window.
     """
     alive = np.flatnonzero((np.einsum("pbii->pbi", bands.spectra[:, :, :2, :2]).real > 0).all(axis=(1, 2))).tolist()
     if not alive:
         return []
-    bands, pairs, leads = bands.of(alive), [pairs[at] for at in alive], [leads[at] for at in alive]
+    bands, pairs = bands.of(alive), [pairs[at] for at in alive]
+    states = [(window.states[pair.first], window.states[pair.second]) for pair in pairs]
     z, v = bands.spectra[:, :, 0, 0].real, bands.spectra[:, :, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.spectra[:, :, 1, 0]) ** 2 / (z * v), _FLOOR)
     h, variance, bias = _transfer(bands, incoherent)
@@ -185,10 +180,14 @@ def read_pairs(
     shared = np.minimum(1.0, np.abs(total) / (np.sqrt(level) * np.sqrt(other)))
     fitted = partial(_fitted, (polarity, log_gain, delay_s))
     alone = fitted(bands.w, h, variance, bias)
-    h, variance, corrected = _without_across(window.states, pairs, bands, polarity, alone, h, variance)
-    alone = fitted(bands.w, h, variance, bias) if corrected else alone
-    given = [np.nan if lead is None else lead for lead in leads]
-    lead_rad_s = np.where(np.isnan(given), _lead(bands.w, polarity, alone, h, variance), given)
+    planes = np.array([_other_plane(window.states, pair) for pair in pairs])
+    across = _without_across(planes, bands, _transfer_of(bands.w, polarity, *alone[::2]), h, variance)
+    if across is not None:
+        h, variance = across
+        alone = fitted(bands.w, h, variance, bias)
+    given = np.array([leads.get(each, np.nan) for each in states])
+    expected = _transfer_of(bands.w, polarity, *alone[::2])
+    lead_rad_s = np.where(np.isnan(given), _lead(bands.w, polarity, expected, h, variance), given)
     if lead_rad_s.any():
         h = h * np.exp(-1j * lead_rad_s[:, None] / bands.w)
         alone = fitted(bands.w, h, variance, bias)
@@ -203,8 +202,8 @@ def read_pairs(
         found = np.where(~there | (foreign & (alone[1] < _RUNOUT)), alone, both)
     figures = np.stack([*found[:2], polarity, *found[2:], shared, lead_rad_s], axis=1).tolist()
     return [
-        PairReading(pair, window.states[pair.first], window.states[pair.second], bands.of(at), *own)
-        for at, (pair, own) in enumerate(zip(pairs, figures, strict=True))
+        PairReading(pair, *names, bands.of(at), *own)
+        for at, (pair, names, own) in enumerate(zip(pairs, states, figures, strict=True))
     ]
 
 
@@ -248,37 +247,27 @@ def _other_plane(states: tuple[str, ...], pair: MotionPair) -> tuple[int, int]:
 
 
 def _without_across(
-    states: tuple[str, ...],
-    pairs: Sequence[MotionPair],
-    bands: Banded,
-    polarity: FloatArray,
-    alone: FloatArray,
-    h: ComplexArray,
-    variance: FloatArray,
-) -> tuple[ComplexArray, FloatArray, bool]:
-    """Transfer functions less what the other plane contributes, if that fits beyond gain, delay and lead.
+    planes: IndexArray, bands: Banded, expected: ComplexArray, h: ComplexArray, variance: FloatArray
+) -> tuple[ComplexArray, FloatArray] | None:
+    """Transfer functions less what the other plane contributes, if that fits beyond gain, delay and lead; else None.
 
-    Their variances grow as not knowing its size widens the errors of gain and delay, whichever is wider. Last comes
-    whether any was corrected.
+    Their variances grow as not knowing its size widens the errors of gain and delay, whichever is wider.
 
     A sensor that is mounted at an angle or sensitive across its axis shows a small part of the other plane's motion. If
     one force moves both planes, that part distorts the transfer, most at frequencies where the sensor's own plane
     hardly moves, and would be mistaken for a gain or a delay.
     """
-    column, rates = np.array([_other_plane(states, pair) for pair in pairs]).T
-    other = bands.spectra[np.arange(len(pairs)), :, column, 0] / bands.spectra[:, :, 0, 0].real
-    other = other * (1j * bands.w) ** rates[:, None]
+    column, rates = planes.T
+    moved = bands.spectra[np.arange(len(planes)), :, column, 0] / bands.spectra[:, :, 0, 0].real
+    other = moved * (1j * bands.w) ** rates[:, None]
     tried = np.flatnonzero((column > 0) & other.any(axis=1))  # a stuck sensor of the other plane gives zeros
     if not tried.size:
-        return h, variance, False
-    other, w = other[tried], bands.w[tried]
-    expected = _transfer_of(w, polarity[tried, None], alone[0, tried, None], alone[2, tried, None])
+        return None
+    other, w, expected = other[tried], bands.w[tried], expected[tried]
     aim, seen, weight = h[tried] / expected - 1, other / expected, np.sqrt(2 / variance[tried])
     sides = np.stack([np.ones_like(seen), 1j * w, 1j / w, seen], axis=2) * weight[:, :, None]
-    design, y = (
-        np.concatenate([sides.real, sides.imag], axis=1),
-        np.append(aim.real * weight, aim.imag * weight, axis=1),
-    )
+    design = np.concatenate([sides.real, sides.imag], axis=1)
+    y = np.concatenate([aim.real * weight, aim.imag * weight], axis=1)
     design /= (lengths := np.linalg.norm(design, axis=1, keepdims=True))
     directions, triangle = np.linalg.qr(design)
     along = directions.swapaxes(1, 2) @ y[:, :, None]
@@ -287,19 +276,21 @@ def _without_across(
     size = along[:, -1, 0] / triangle[:, -1, -1] / lengths[:, 0, -1]
     fits = (along[:, -1, 0] ** 2 > _TOLD_APART * scatter) & (np.abs(size) < _MOST_ACROSS)
     if not fits.any():
-        return h, variance, False
+        return None
     h, variance = h.copy(), variance.copy()
     h[tried[fits]] -= (size[:, None] * other)[fits]
     inverse = np.linalg.inv(np.linalg.qr(design[fits][:, :, [0, 1, 3]], mode="r"))  # of gain, delay, the other plane
     variance[tried[fits]] *= (inverse[:, :2] ** 2).sum(axis=2).max(axis=1)[:, None]
-    return h, variance, True
+    return h, variance
 
 
-def _lead(w: FloatArray, polarity: FloatArray, alone: FloatArray, h: ComplexArray, variance: FloatArray) -> FloatArray:
+def _lead(
+    w: FloatArray, polarity: FloatArray, expected: ComplexArray, h: ComplexArray, variance: FloatArray
+) -> FloatArray:
     """Phase lead of the second times w; 0 unless it explains the phases of all bands better than a delay."""
     weight, ahead = 2 / variance, np.angle(np.asarray(polarity[:, None] * h))
     lead_rad_s = (weight * ahead / w).sum(axis=1) / (weight * w**-2.0).sum(axis=1)
-    late = np.angle(h / _transfer_of(w, polarity[:, None], alone[0, :, None], alone[2, :, None]))
+    late = np.angle(h / expected)
     as_delay, as_lead = ((weight * left**2).sum(axis=1) for left in (late, ahead - lead_rad_s[:, None] / w))
     scatter = np.maximum(1.0, as_lead / max(1, w.shape[1] - 1))
     return np.where(as_delay - as_lead > _TOLD_APART * scatter, lead_rad_s, 0.0)
@@ -332,9 +323,7 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     scale = 1 / np.sqrt(np.maximum(np.einsum("pbii->pbi", S).real, np.finfo(float).tiny))
     unit = S * scale[..., None] * scale[:, :, None]
     others = unit[:, :, 2:, 2:] + 1e-9 * np.eye(n - 2)
-    a = (
-        np.linalg.solve(others, unit[:, :, 2:, :1]).conj().swapaxes(2, 3)
-    )  # prediction of z by the other places, z = a w
+    a = np.linalg.solve(others, unit[:, :, 2:, :1]).conj().swapaxes(2, 3)  # prediction from the other places: z = a w
     seen, own = (a @ unit[:, :, 2:, :2])[:, :, 0].transpose(2, 0, 1)
     seen = seen.real
     overfit = (n - 2) / bands.averages  # part that the others would explain of pure noise

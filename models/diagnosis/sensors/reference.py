@@ -273,12 +273,13 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
     pairs = []
     for pair in motion_pairs(states):
         bands = [(window, [pair], banded(window, [pair])) for window in windows]
-        there = [one for each in bands for one in read_pairs(*each, [None])]
+        there = [one for each in bands for one in read_pairs(*each, {})]
         if len(there) < len(windows):
             raise EstimationError(f"no fluctuation in {states[pair.first]} or {states[pair.second]}")
         lead_rad_s = float(np.median([one.lead_rad_s for one in there]))
         if any(one.lead_rad_s for one in there):
-            there = [one for each in bands for one in read_pairs(*each, [lead_rad_s])]
+            leads = {(states[pair.first], states[pair.second]): lead_rad_s}
+            there = [one for each in bands for one in read_pairs(*each, leads)]
         noises = [PairNoise(window, one) for window, one in zip(windows, there, strict=True)]
         pairs.append(_pair(there, _noise([(one.noise, one.noise / one.scale) for one in noises])))
     noise = {
