@@ -75,8 +75,8 @@ def reversed_signs(window: WindowStatistics) -> str:
         return ""
     unit = vectors / np.abs(vectors).mean(axis=0)
     scatter = np.median(np.abs(np.diff(unit, axis=0)), axis=0)
-    if np.any(scatter > _MOST_SCATTER):
-        return ""
+    if np.any(scatter > _MOST_SCATTER) or np.all(np.abs(np.angle(unit / unit[0])) < np.pi / 4):
+        return ""  # within an eighth of a turn of the first: no two are opposite
     # Between the two sides may be a hop astride the reversal.
     sides = [(unit[:hop], unit[hop + 1 :]) for hop in range(1, len(unit) - 1)]
     before, after = min(sides, key=lambda both: sum(side.var(axis=0).sum() * len(side) for side in both))
