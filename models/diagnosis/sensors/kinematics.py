@@ -299,12 +299,14 @@ def _lead(
 def _transfer_at_1x(
     window: WindowStatistics, bands: Banded, incoherent: FloatArray
 ) -> tuple[BoolArray, float, ComplexArray, FloatArray] | None:
-    """Where z has 1x power, the speed, and the transfer at 1x with its relative variance; None without 1x vectors."""
+    """Where z has 1x power, the speed, and the transfer at 1x with its relative variance; None if nowhere."""
     if bands.rotation is None:
         return None
     speed, vectors = bands.rotation
     power = np.sum(np.abs(vectors[:, :, 0]) ** 2, axis=1)
     there = (power > 0) & np.isfinite(power)
+    if not there.any():  # a shaft angle that stands still has no speed
+        return None
     power = np.where(there, power, 1.0)
     ratio = np.where(there, np.sum(vectors[:, :, 0].conj() * vectors[:, :, 1], axis=1) / power, 1.0)
     near = np.arange(len(power)), np.abs(bands.w - speed).argmin(axis=1)
