@@ -240,7 +240,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         for field in ("length_s", "hop_s", "segment_s", "lag_step_s"):
             samples = getattr(window, field) * rate_hz
             if not whole(samples):
-                yield f"window.{field} is {samples:.6g} samples at {rate_hz} Hz, expected a whole number"
+                yield f"window.{field} is {samples:.12g} samples at {rate_hz} Hz, expected a whole number"
         if round(window.segment_s * rate_hz) % 2:
             yield f"window.segment_s {window.segment_s} is an odd number of samples, expected an even one"
         yield from self._faults_of_hops()
