@@ -226,7 +226,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     pieces = [replace(piece, window=piece.window.without_lines) for piece in pieces]
     groups = [pieces]
     baselines = [_baseline(groups[0])]
-    agreement = check_recordings(disagreements(baselines[0]), _speeds(pieces))
+    agreement = check_recordings(machine, disagreements(baselines[0]), _speeds(pieces))
     if agreement is not None and agreement.verdict == "limited":
         groups = _by_speed(pieces)
         baselines = [_baseline(group) for group in groups]

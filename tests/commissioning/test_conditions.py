@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from models.commissioning.checks import Check, check_sources
+from models.commissioning.checks import Check, check_recordings, check_sources
 from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import Installed
 from models.commissioning.healthy import HealthyRecording
@@ -83,6 +83,15 @@ def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     verdict, text, _ = told_of(made, "recordings agree")
     assert verdict == "refused"
     assert "at one speed" in text
+
+
+@pytest.mark.parametrize(("by", "verdict"), [(-0.03, "passed"), (0.03, "passed"), (-0.04, "refused")])
+def test_a_difference_that_matters_to_no_alarm_is_no_reason_to_refuse(by: float, verdict: str) -> None:
+    """With one source a difference of one per cent may be four standard errors; k_by is reported from 10 % on."""
+    at_one_speed = {"monday.mcap": 138.2, "friday.mcap": 138.2}
+    found = check_recordings(NOTHING, [("k_by", by, "friday.mcap: it differs")], at_one_speed)
+    assert sure(found).verdict == verdict
+    assert sure(found).text.startswith("friday.mcap: it differs")
 
 
 DRAW = Draw(LAB, 7_700_077, Purpose.EVALUATION, stream=0, layout=Layout.ONE_SOURCE)

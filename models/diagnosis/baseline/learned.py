@@ -294,8 +294,8 @@ def _reason(row: Row, relation: Relation, *, alone: bool) -> str:
     return ""
 
 
-def disagreements(baseline: Baseline) -> tuple[str, ...]:
-    """Sentences on conditions in which a parameter reads differently than in all others.
+def disagreements(baseline: Baseline) -> tuple[tuple[str, float, str], ...]:
+    """Conditions in which a parameter reads differently than in all others: parameter, its change, and a sentence.
 
     Readings of one condition share the error of the relation, so the mean of their z is tested as a single one. If
     there are such conditions, keep a baseline for each. In any case `Relation.allowance` widens the errors of later
@@ -310,8 +310,6 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
             if abs(z) > _DISAGREE:
                 change = float(np.mean([each.change for each in readings]))
                 where = condition or "part of the recording"
-                found.append(
-                    f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what was learned "
-                    f"from the others ({abs(z):.0f} standard errors)"
-                )
+                text = f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what was learned"
+                found.append((name, change, f"{text} from the others ({abs(z):.0f} standard errors)"))
     return tuple(found)
