@@ -31,7 +31,7 @@ class ReplayList extends LiveElement {
   async ask() {
     const found = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
     const said = JSON.stringify(found);
-    if (said === this.#said) return;
+    if (said === this.#said && this.answered) return; // unanswered, a message stands in place of the list
     this.#said = said;
     const rows = found.map((one) => ({
       key: one.id,

@@ -80,6 +80,14 @@ def test_no_recording_is_not_shown_before_the_list_has_loaded(browser: Browser, 
         expect(page.locator("recordings-view")).not_to_contain_text("No recording")
         held["recordings"].continue_()
         expect(page.locator("recording-table")).to_contain_text("20260101T000000Z.mcap")
+        replays = page.locator("replay-list")
+        expect(replays).not_to_be_empty()
+        answered = replays.inner_text()
+        load, cut = "document.querySelector('replay-list').load();", "window.fetch = () => Promise.reject('cut');"
+        page.evaluate(f"() => {{ const real = window.fetch; {cut} {load} window.fetch = real; }}")
+        expect(replays.get_by_role("status")).to_contain_text("the monitor does not answer")
+        page.evaluate(load)
+        expect(replays).to_have_text(answered)  # the list is back, although it has not changed meanwhile
 
 
 def test_a_recording_is_replayed_with_other_settings_and_browsed_by_window(browser: Browser, runtime: Runtime) -> None:
