@@ -34,6 +34,9 @@ _ONE_SPEED, _LEAKS = 0.01, 2  # relative change of speed from which on a line ha
 _UNSURE = 1e3  # factor on the error of a hop that does not count
 _HANN_LOSS = 0.95  # part of the data's information that half-overlapping Hann segments keep
 _FLOOR = 1e-10
+_LEAKED = 0.4
+"""Spread of a Hann window's power, bins squared: 1/3 for a smooth spectrum, up to 1/2 for a line. Beside a resonance
+the power in a bin is of a frequency nearer to it, by this times the slope of the power over the power."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,7 @@ class Banded:
 
     w: FloatArray  # (…, n_bands), angular frequency at the centroid of each band's power
     averages: FloatArray  # (n_bands,), number of effectively independent samples
+    leaked: FloatArray  # (…, n_bands), relative error of z by power that the window leaks across the edges of a band
     # (…, n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the synchronous part
     spectra: ComplexArray
     total: ComplexArray  # (…, n_bands, 2, 2), including the synchronous part
@@ -54,7 +58,7 @@ class Banded:
     def of(self, at: int | Sequence[int]) -> "Banded":
         """Those of one of several pairs, or of some."""
         rotation = None if self.rotation is None else (self.rotation[0], self.rotation[1][at])
-        return Banded(self.w[at], self.averages, self.spectra[at], self.total[at], rotation)
+        return Banded(self.w[at], self.averages, self.leaked[at], self.spectra[at], self.total[at], rotation)
 
 
 def banded(window: WindowStatistics, pairs: Sequence[MotionPair]) -> Banded:
@@ -84,7 +88,11 @@ def banded(window: WindowStatistics, pairs: Sequence[MotionPair]) -> Banded:
         rotation = speed, both
     centre = np.ascontiguousarray((np.add.reduceat(power * w[:, None], edges) / np.add.reduceat(power, edges)).T)
     averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
-    return Banded(centre, averages, spectra, total, rotation)
+    of_x = window.spectrum[:, first, first].real
+    across = np.add.reduceat(np.gradient(of_x, w, axis=0), edges) * [pair.order for pair in pairs]
+    within = np.maximum(np.add.reduceat(of_x * w[:, None], edges), np.finfo(float).tiny)
+    leaked = (_LEAKED * (w[1] - w[0]) ** 2 * across / within).T
+    return Banded(centre, averages, leaked, spectra, total, rotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +327,7 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
     S = bands.spectra
     z, v, cross, n = S[:, :, 0, 0].real, S[:, :, 1, 1].real, S[:, :, 1, 0], S.shape[-1]
     half = -0.5 * np.log(1 - np.minimum(incoherent, 1 - 1e-6))
-    variance = incoherent / np.maximum(1 - incoherent, 1e-6) / bands.averages
+    variance = incoherent / np.maximum(1 - incoherent, 1e-6) / bands.averages + 2 * bands.leaked**2
     if n == 2:
         return np.sqrt(v / z) * cross / np.maximum(np.abs(cross), _FLOOR * np.sqrt(z * v)), variance, half
     scale = 1 / np.sqrt(np.maximum(np.einsum("pbii->pbi", S).real, np.finfo(float).tiny))
