@@ -148,11 +148,6 @@ def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
     return rotor.model_copy(update={**grown, "e_m": rotor.e_m / factor})
 
 
-def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
-    """Theoretical rms of each of the twelve states in a condition, see `theoretical_moments`."""
-    return np.asarray(np.sqrt(np.diag(theoretical_moments(machine, condition))), dtype=np.float64)
-
-
 def theoretical_moments(machine: Machine, condition: Condition) -> FloatArray:
     """Mean products of the twelve states in a condition, stochastic and synchronous together; SI, shape (12, 12).
 

@@ -16,7 +16,7 @@ from models.diagnosis.sensors.reference import SensorReference, learn_sensor_ref
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.channels import Channel, Quantity, state_name
-from simulator.plant import theoretical_rms
+from simulator.plant import theoretical_moments
 from simulator.scenario import Event, Scenario
 from simulator.timeline import compile_timeline
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
@@ -78,7 +78,7 @@ def _event(
     at_s = 0.0 if rng.random() < 0.5 else float(rng.uniform(0.1, 0.6)) * scenario.duration_s
     sign = 1.0 if rng.random() < 0.5 else -1.0
     condition = compile_timeline(scenario, machine).conditions[-1][1]
-    rms = float(theoretical_rms(machine, condition)[STATE_INDEX[state_name(channel)]])
+    rms = float(np.sqrt(np.diag(theoretical_moments(machine, condition)))[STATE_INDEX[state_name(channel)]])
     fields: dict[str, object] = {"at_s": at_s, "sensor": channel.name, "sensor_fault": fault}
     size = 0.0
     match fault:

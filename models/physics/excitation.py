@@ -54,17 +54,17 @@ def colouring_filter(source: Source) -> ColouringFilter:
     if source.hump_share == 0:
         return floor
     w = 2 * math.pi * source.hump_hz
-    n = source.order
-    R = np.zeros((n + 2, n + 2))
-    R[:n, :n] = floor.R
-    R[n:, n:] = w * np.array([[0.0, 1.0], [-1.0, -2 * source.hump_damping]])
-    S = np.zeros((n + 2, 2))
-    S[:n, :1] = floor.S
-    S[n + 1, 1] = 2 * math.sqrt(source.hump_damping * w)  # makes both states of unit variance
-    output = np.zeros(n + 2)
-    output[0] = math.sqrt(1 - source.hump_share)
-    output[n + 1] = math.sqrt(source.hump_share)
-    return ColouringFilter(R, S, output)
+    drive = 2 * math.sqrt(source.hump_damping * w)  # makes both states of unit variance
+    R = _block_diag(floor.R, w * np.array([[0.0, 1.0], [-1.0, -2 * source.hump_damping]]))
+    output = np.append(math.sqrt(1 - source.hump_share) * floor.output, [0.0, math.sqrt(source.hump_share)])
+    return ColouringFilter(R, _block_diag(floor.S, np.array([[0.0], [drive]])), output)
+
+
+def _block_diag(*blocks: FloatArray) -> FloatArray:
+    """Return the matrix with these blocks on its diagonal."""
+    from scipy.linalg import block_diag  # noqa: PLC0415  # no --help waits for SciPy
+
+    return np.asarray(block_diag(*blocks), dtype=np.float64)
 
 
 def _butterworth(cutoff_hz: float, order: int) -> ColouringFilter:
@@ -80,26 +80,16 @@ def _butterworth(cutoff_hz: float, order: int) -> ColouringFilter:
     polynomial = np.poly(np.exp(1j * angles)).real  # highest power first, 1 at both ends
     R = np.diag(np.ones(order - 1), 1)
     R[-1] = -polynomial[:0:-1]
-    S[-1, 0] = w * math.sqrt(_floor_density(cutoff_hz, order))
+    S[-1, 0] = w * math.sqrt(floor_density(cutoff_hz, order))
     return ColouringFilter(w * R, S, output)
 
 
-def _floor_density(cutoff_hz: float, order: int) -> float:
+def floor_density(cutoff_hz: float, order: int) -> float:
     """Two-sided density at zero frequency of Butterworth low-pass noise with unit variance, 1/Hz.
 
     The filter's two-sided noise bandwidth is 2 f_c (π/2n) / sin(π/2n).
     """
     return math.sin(math.pi / (2 * order)) * order / (math.pi * cutoff_hz)
-
-
-def source_spectrum(frequency_hz: FloatArray, source: Source) -> FloatArray:
-    """Two-sided power spectral density of a source's force, N²/Hz; same shape as `frequency_hz`."""
-    fallen = 1 + (frequency_hz / source.cutoff_hz) ** (2 * source.order)
-    floor = _floor_density(source.cutoff_hz, source.order) / fallen
-    r2 = (frequency_hz / source.hump_hz) ** 2
-    hump = 2 * source.hump_damping / (math.pi * source.hump_hz) * r2 / ((1 - r2) ** 2 + 4 * source.hump_damping**2 * r2)
-    density = (1 - source.hump_share) * floor + source.hump_share * hump
-    return np.asarray(source.force_rms_N**2 * density, dtype=np.float64)
 
 
 def low_pass(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> FloatArray:
@@ -120,17 +110,13 @@ def low_pass_slopes(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2
 def expanded_A(rotor: RotorParameters, speed_rad_s: float, sources: tuple[Source, ...]) -> FloatArray:
     """System matrix A* of rotor and filters (Eq. 12), shape (n, n): 12 rotor states, then each source's filter."""
     filters = [colouring_filter(source) for source in sources]
-    size = 12 + sum(colour.output.size for colour in filters)
-    A = np.zeros((size, size))
-    A[:12, :12] = system_A(rotor, speed_rad_s)
+    A = _block_diag(system_A(rotor, speed_rad_s), *(colour.R for colour in filters))
     inverse_masses = 1 / np.diag(M_matrix(rotor))
     u = 12
     for source, colour in zip(sources, filters, strict=True):
-        end = u + colour.output.size
         for state in np.flatnonzero(colour.output):
             A[6:12, u + state] = inverse_masses * np.array(source.direction) * source.force_rms_N * colour.output[state]
-        A[u:end, u:end] = colour.R
-        u = end
+        u += colour.output.size
     return A
 
 
@@ -139,11 +125,4 @@ def expanded_B(sources: tuple[Source, ...]) -> FloatArray:
 
     One column per source, two for a source with a hump.
     """
-    filters = [colouring_filter(source) for source in sources]
-    B = np.zeros((12 + sum(len(colour.S) for colour in filters), sum(colour.S.shape[1] for colour in filters)))
-    row, column = 12, 0
-    for colour in filters:
-        states, drives = colour.S.shape
-        B[row : row + states, column : column + drives] = colour.S
-        row, column = row + states, column + drives
-    return B
+    return _block_diag(np.empty((12, 0)), *(colouring_filter(source).S for source in sources))

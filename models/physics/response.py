@@ -93,10 +93,7 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
     scale = np.where(deviation > 0, deviation, 1.0)
     scaled_A = A * (scale / scale[:, None])
     scaled_B = B / scale[:, None]
-    loan = np.zeros((2 * n, 2 * n))
-    loan[:n, :n] = -scaled_A
-    loan[:n, n:] = scaled_B @ scaled_B.T
-    loan[n:, n:] = scaled_A.T
+    loan = np.block([[-scaled_A, scaled_B @ scaled_B.T], [np.zeros((n, n)), scaled_A.T]])
     exponential = scipy.linalg.expm(loan * step_s)
     F = exponential[n:, n:].T
     covariance = F @ exponential[:n, n:]

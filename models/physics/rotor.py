@@ -157,11 +157,8 @@ def Q_shaft(rotor: RotorParameters) -> FloatArray:
     L = rotor.shaft_length_m
     a, b, c = 12 * rotor.EI_N_m2 / L**3, 6 * rotor.EI_N_m2 / L**2, 4 * rotor.EI_N_m2 / L
     plane = np.array([[a, -a, b], [-a, a, -b], [b, -b, c]])
-    mirror = np.diag([1.0, 1.0, -1.0])
-    Q = np.zeros((6, 6))
-    Q[:3, :3] = plane
-    Q[3:, 3:] = mirror @ plane @ mirror
-    return Q
+    mirror, apart = np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3))
+    return np.block([[plane, apart], [apart, mirror @ plane @ mirror]])
 
 
 def Q_matrix(rotor: RotorParameters) -> FloatArray:
@@ -196,11 +193,8 @@ def H_matrix(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
 def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     """System matrix A of the state equation (Eq. 4), shape (12, 12)."""
     inverse_masses = 1 / np.diag(M_matrix(rotor))[:, None]
-    A = np.zeros((12, 12))
-    A[:6, 6:] = np.eye(6)
-    A[6:, :6] = -inverse_masses * Q_matrix(rotor)
-    A[6:, 6:] = -inverse_masses * P_matrix(rotor, speed_rad_s)
-    return A
+    forces = [-inverse_masses * Q_matrix(rotor), -inverse_masses * P_matrix(rotor, speed_rad_s)]
+    return np.block([[np.zeros((6, 6)), np.eye(6)], forces])
 
 
 def natural_frequencies(rotor: RotorParameters, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:

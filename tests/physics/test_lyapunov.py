@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from benchmarks.studies.methods.bound import source_spectrum
 from models.errors import EstimationError
 from models.machine import load_machine
-from models.physics.excitation import (
-    Source,
-    colouring_filter,
-    expanded_A,
-    expanded_B,
-    low_pass,
-    low_pass_slopes,
-    source_spectrum,
-)
+from models.physics.excitation import Source, colouring_filter, expanded_A, expanded_B, low_pass, low_pass_slopes
 from models.physics.response import advance, correlation, discretise, stationary_covariance, synchronous_response
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, system_A
 

@@ -33,9 +33,10 @@ from benchmarks.finite_elements.observed import (
 )
 from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc, changed_rotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from benchmarks.studies.methods.bound import source_spectrum
 from models.diagnosis.window.moments import plan_for
 from models.errors import EstimationError
-from models.physics.excitation import Source, source_spectrum
+from models.physics.excitation import Source
 from models.signals.block import FloatArray
 from tests.sure import sure
 from tests.windows import last_window

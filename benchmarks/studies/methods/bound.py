@@ -19,11 +19,11 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, ST
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
 from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
-from models.physics.excitation import source_spectrum
+from models.physics.excitation import Source, floor_density
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import FloatArray
-from simulator.plant import theoretical_rms
+from simulator.plant import theoretical_moments
 from simulator.scenario import Scenario
 from simulator.timeline import Condition
 
@@ -110,11 +110,21 @@ def bound_of(scenario: Scenario, machine: Machine) -> dict[str, float]:
     return cramer_rao(machine, states, _true_condition(scenario, machine), machine.window.length_s)
 
 
+def source_spectrum(frequency_hz: FloatArray, source: Source) -> FloatArray:
+    """Two-sided power spectral density of a source's force, N²/Hz; same shape as `frequency_hz`."""
+    fallen = 1 + (frequency_hz / source.cutoff_hz) ** (2 * source.order)
+    floor = floor_density(source.cutoff_hz, source.order) / fallen
+    r2 = (frequency_hz / source.hump_hz) ** 2
+    hump = 2 * source.hump_damping / (np.pi * source.hump_hz) * r2 / ((1 - r2) ** 2 + 4 * source.hump_damping**2 * r2)
+    density = (1 - source.hump_share) * floor + source.hump_share * hump
+    return np.asarray(source.force_rms_N**2 * density, dtype=np.float64)
+
+
 def _true_condition(scenario: Scenario, machine: Machine) -> TrueCondition:
     changes = {one.parameter: one.relative_change for one in scenario.events if one.parameter}
     truth = {name: float(change) for name, change in changes.items() if change is not None}
     speed_rpm = [one.speed_rpm for one in scenario.events if one.speed_rpm is not None][-1]
-    rms = theoretical_rms(machine, Condition(truth, speed_rpm, scenario.sources))
+    rms = np.sqrt(np.diag(theoretical_moments(machine, Condition(truth, speed_rpm, scenario.sources))))
     states = [STATE_INDEX[name] for name in plan_for(machine).states]
     low_hz, high_hz = machine.window.band_hz
     frequencies_hz = np.linspace(low_hz, high_hz, 64)

@@ -9,7 +9,7 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.channels import Quantity
-from simulator.plant import NonlinearPlant, theoretical_rms
+from simulator.plant import NonlinearPlant, theoretical_moments
 from simulator.scenario import Event, NamedSource, Rub, Scenario
 from simulator.timeline import Condition
 from simulator.training.draws import Draw, generator
@@ -110,7 +110,8 @@ def _with_anomaly(draw: UnusualDraw, scenario: Scenario, rng: np.random.Generato
             ramp_s = scenario.duration_s if rng.random() < 0.5 else 0.0
             event = Event(at_s=0, ramp_s=ramp_s, sensor=channel, sensor_fault="gain", value_SI=1 + size)
         case Anomaly.RUB:
-            rms = theoretical_rms(draw.machine, Condition(changes, speed_rpm, scenario.sources))
+            condition = Condition(changes, speed_rpm, scenario.sources)
+            rms = np.sqrt(np.diag(theoretical_moments(draw.machine, condition)))
             rub = Rub(clearance_m=_CLEARANCE * float(np.hypot(rms[STATE_INDEX["y2"]], rms[STATE_INDEX["z2"]])))
             event = Event(at_s=0, anomaly="rub", size=size)
         case Anomaly.CRACK:
