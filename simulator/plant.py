@@ -34,7 +34,7 @@ import scipy.linalg
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.response import DiscreteSystem, advance, discretise, stationary_covariance, synchronous_response
+from models.physics.response import advance, discretise, stationary_covariance, synchronous_response
 from models.physics.rotor import STATE_INDEX, M_matrix, Q_matrix, Q_shaft, RotorParameters, changed
 from models.signals.block import FloatArray
 from simulator.timeline import Condition
@@ -96,7 +96,7 @@ class Plant:
         """Return the next `n_samples` samples and move on."""
         theta = self._angles(n_samples)
         noise = self._noise(n_samples)
-        after = advance(self._system, self._d, noise)
+        after = advance(self._F, self._G, self._d, noise)
         states = self._synchronous(theta)
         states[0] += self._d[:12]
         states[1:] += after[:-1, :12]
@@ -117,7 +117,7 @@ class Plant:
         A = expanded_A(rotor, speed_rad_s, condition.sources)
         if not np.array_equal(A, self._A):  # a changed unbalance alone leaves the discretisation as it is
             self._A = A
-            self._system: DiscreteSystem = discretise(A, expanded_B(condition.sources), 1 / self._machine.rate_hz)
+            self._F, self._G = discretise(A, expanded_B(condition.sources), 1 / self._machine.rate_hz)
         self._q1, self._q2 = synchronous_response(rotor, speed_rad_s)
         self._speed_rpm = condition.speed_rpm
         self._revolutions_per_sample = condition.speed_rpm / 60 / self._machine.rate_hz
@@ -220,8 +220,8 @@ class NonlinearPlant(Plant):
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)
         theta = self._angles(n_samples)
-        driven = self._noise(n_samples) @ self._system.G.T
-        transitions = np.broadcast_to(self._system.F, (n_samples, *self._system.F.shape))
+        driven = self._noise(n_samples) @ self._G.T
+        transitions = np.broadcast_to(self._F, (n_samples, *self._F.shape))
         if self._crack is not None:
             both = (_harmonics(theta) @ self._crack).reshape(n_samples, self._d.size, -1)
             transitions = np.ascontiguousarray(both[:, :, :-1])

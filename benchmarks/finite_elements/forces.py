@@ -52,12 +52,12 @@ def force_samples(forces: tuple[Force, ...], count: int, rate_hz: float, rng: np
     drives = np.empty((count, len(forces)))
     for number, force in enumerate(forces):
         colour = force.colour
-        system = discretise(colour.R, colour.S, 1 / rate_hz)
+        F, G = discretise(colour.R, colour.S, 1 / rate_hz)
         stationary = stationary_covariance(colour.R, colour.S)
         values, vectors = np.linalg.eigh((stationary + stationary.T) / 2)
         start = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         noise = rng.standard_normal((count, len(values)))
-        drives[:, number] = advance(system, start, noise) @ colour.output
+        drives[:, number] = advance(F, G, start, noise) @ colour.output
     return drives @ distribution(forces)
 
 

@@ -5,8 +5,6 @@ References
 C. F. Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23 (1978).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.linalg
 
@@ -73,20 +71,12 @@ def synchronous_response(rotor: RotorParameters, speed_rad_s: float) -> tuple[Fl
     return x.real.copy(), -x.imag
 
 
-@dataclass(frozen=True, slots=True)
-class DiscreteSystem:
-    """x[k+1] = F x[k] + G w[k], w standard normal."""
-
-    F: FloatArray  # (n, n), state transition over one sample
-    G: FloatArray  # (n, n), factor of the process-noise covariance
-
-
-def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
-    """Discretise ẋ = A x + B w exactly for one sample of `step_s` seconds.
+def discretise(A: FloatArray, B: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
+    """Discretise ẋ = A x + B w exactly: F and G, shape (n, n), of x[k+1] = F x[k] + G w[k] with w standard normal.
 
     Displacement, velocity and filter states differ by many orders of magnitude. They are scaled to unit standard
     deviation before the covariance is factored; otherwise displacement and velocity become inconsistent and damping is
-    wrong by tens of percent. The result is for the original states. A and B are as in `stationary_covariance`.
+    wrong by tens of percent. A sample is `step_s` seconds; A and B are as in `stationary_covariance`.
     """
     n = A.shape[0]
     deviation = np.sqrt(np.diag(stationary_covariance(A, B)))
@@ -99,10 +89,10 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
     covariance = F @ exponential[:n, n:]
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     G = vectors * np.sqrt(np.maximum(values, 0.0))  # full rank in theory only: rounding gives values below 0
-    return DiscreteSystem(F * (scale[:, None] / scale), G * scale[:, None])
+    return F * (scale[:, None] / scale), G * scale[:, None]
 
 
-def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> FloatArray:
+def advance(F: FloatArray, G: FloatArray, state: FloatArray, noise: FloatArray) -> FloatArray:
     """States after each of many steps, shape (n_samples, n), from the state before the first one, shape (n,).
 
     Equals the recursion ``x = F @ x + G @ w`` row by row, with standard normal noise, shape (n_samples, n). The samples
@@ -113,9 +103,9 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
     length = max(1, int(np.sqrt(n_samples)))
     pieces = -(-n_samples // length)
     driven = np.zeros((pieces * length, n))
-    driven[:n_samples] = noise @ system.G.T
+    driven[:n_samples] = noise @ G.T
     x = np.ascontiguousarray(driven.reshape(pieces, length, n).transpose(1, 0, 2))
-    powers = system.F.T[np.newaxis]  # powers 1, 2, … of the transposed matrix
+    powers = F.T[np.newaxis]  # powers 1, 2, … of the transposed matrix
     while len(powers) < length:
         powers = np.concatenate([powers, powers @ powers[-1]])
     for k in range(1, length):

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
@@ -39,18 +38,13 @@ _COMPARED = {
 }
 
 
-class ReportPicture(NamedTuple):
-    """A picture with its title and caption."""
-
-    title: str
-    svg: Markup
-    caption: str
-
-
 def pictures_of(
     report: CommissioningReport, names: Sequence[str], portraits: Sequence[Portrait]
-) -> tuple[ReportPicture, ...]:
-    """Draw the pictures for which there are data; names of all recordings, portraits of those with usable data."""
+) -> tuple[tuple[str, Markup, str], ...]:
+    """Draw the pictures for which there are data, each with its title before it and its caption after it.
+
+    Names are those of all recordings, portraits of those with usable data.
+    """
     drawn: list[tuple[str, str, Callable[[], Figure | None], str]] = [
         (
             "readings",
@@ -73,7 +67,7 @@ def pictures_of(
             ("levels", "Speed and level over time", lambda: draw_levels(portraits), _levels_caption(portraits)),
         ]
     pictures = ((title, inline_svg(name, title, paint), caption) for name, title, paint, caption in drawn)
-    return tuple(ReportPicture(title, svg, caption) for title, svg, caption in pictures if svg is not None)
+    return tuple((title, svg, caption) for title, svg, caption in pictures if svg is not None)
 
 
 def _spectra_caption(portraits: Sequence[Portrait]) -> str:

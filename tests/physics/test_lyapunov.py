@@ -87,23 +87,23 @@ def test_discretisation_keeps_the_stationary_covariance() -> None:
     machine = load_machine("lab")
     A, B = expanded_A(machine.rotor, machine.operation.speed_rad_s, SOURCES), expanded_B(SOURCES)
     R = stationary_covariance(A, B)
-    system = discretise(A, B, 1 / 2000)
+    F, G = discretise(A, B, 1 / 2000)
     deviation = np.sqrt(np.diag(R))
-    kept = (system.F @ R @ system.F.T + system.G @ system.G.T) / np.outer(deviation, deviation)
+    kept = (F @ R @ F.T + G @ G.T) / np.outer(deviation, deviation)
     np.testing.assert_allclose(kept, R / np.outer(deviation, deviation), atol=1e-11)
 
 
 def test_advance_equals_the_recursion() -> None:
     rng = np.random.default_rng(0)
     A, B = expanded_A(load_machine("lab").rotor, 138.0, SOURCES), expanded_B(SOURCES)
-    system = discretise(A, B, 1 / 2000)
+    F, G = discretise(A, B, 1 / 2000)
     scale = np.sqrt(np.diag(stationary_covariance(A, B)))
     for n_samples in (1, 2, 37, 1000):
         x = scale * rng.standard_normal(scale.size)
         noise = rng.standard_normal((n_samples, scale.size))
-        got = advance(system, x, noise)
+        got = advance(F, G, x, noise)
         for step, w in enumerate(noise):
-            x = system.F @ x + system.G @ w
+            x = F @ x + G @ w
             np.testing.assert_allclose(got[step] / scale, x / scale, atol=1e-10)
 
 
@@ -111,9 +111,9 @@ def test_process_noise_of_a_double_integrator_has_its_closed_form() -> None:
     """White force of intensity S on a barely bound mass: G Gᵀ = S/m² [[T³/3, T²/2], [T²/2, T]]."""
     S, m, T = 4.0, 2.0, 1e-4
     A = np.array([[0.0, 1.0], [-1e-6, -1e-3]])
-    system = discretise(A, np.array([[0.0], [np.sqrt(S) / m]]), T)
+    _, G = discretise(A, np.array([[0.0], [np.sqrt(S) / m]]), T)
     expected = S / m**2 * np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]])
-    np.testing.assert_allclose(system.G @ system.G.T, expected, rtol=1e-5)
+    np.testing.assert_allclose(G @ G.T, expected, rtol=1e-5)
 
 
 DIRECTION = (0.2, 0.7, 0.01, 0.5, 1.0, 0.02)

@@ -60,18 +60,13 @@ def shape_for(deepest: int, band_to_hz: float, time_scale: float) -> Shape:
     return Shape(8, width_s, _LEAD * width_s, spacing_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Kernels:
-    """Kernels over the lags of a window."""
-
-    # By order n of the derivative, (n_kernels, n_lags): (-1)ⁿ κ⁽ⁿ⁾ times the spacing of the lags
-    values: tuple[FloatArray, ...]
-    centres_s: FloatArray  # (n_kernels,)
-
-
 @lru_cache(maxsize=256)
-def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
-    """Kernels from a shortest lag on, and up to `deepest` derivatives, at most 4; the lags are equally spaced."""
+def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> tuple[tuple[FloatArray, ...], FloatArray]:
+    """Kernels from a shortest lag on, and up to `deepest` derivatives, at most 4; the lags are equally spaced.
+
+    By order n of the derivative, (n_kernels, n_lags): (-1)ⁿ κ⁽ⁿ⁾ times the spacing of the lags. With them come their
+    centres, (n_kernels,).
+    """
     lags_s = np.frombuffer(lags)
     step_s = float(lags_s[1] - lags_s[0])
     spacing_s = max(1, round(shape.spacing_s / step_s)) * step_s
@@ -86,7 +81,7 @@ def kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kerne
             # d/dτ advances the phase of cos(2π m u) by π/2
             value += weight * (2 * np.pi * m / width_s) ** order * np.cos(2 * np.pi * m * u + order * np.pi / 2)
         values.append(np.where(inside, (-1) ** order * value, 0.0) * (step_s / width_s))
-    return Kernels(tuple(values), centres)
+    return tuple(values), centres
 
 
 def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
@@ -115,7 +110,7 @@ class LagMoments:
     """Moments of one row in one window beyond a shortest lag."""
 
     of: "RowWindow"
-    kernels: Kernels
+    centres_s: FloatArray  # (n_kernels,)
     values: FloatArray  # (n_moments, n_terms), one row per reference and kernel, SI units
     hop_values: FloatArray  # (n_hops, n_moments, n_terms), the same for every hop
     index: IndexArray  # (n_moments, n_moments), positions of a covariance's elements in `of.blocks`
@@ -173,7 +168,7 @@ class RowWindow:
         """Moments beyond a shortest lag."""
         window, formation = self.window, self.formation
         references = [window.states.index(name) for name in self.references]
-        over = kernels(window.lags_s.tobytes(), lag_from_s, self.shape, formation.deepest)
+        over, centres_s = kernels(window.lags_s.tobytes(), lag_from_s, self.shape, formation.deepest)
 
         def moments(correlation: FloatArray) -> FloatArray:
             seen: dict[tuple[str, int], FloatArray] = {}
@@ -184,14 +179,14 @@ class RowWindow:
                     key = source.state, source.derivatives
                     if key not in seen:
                         column = window.states.index(source.state)
-                        seen[key] = over.values[source.derivatives] @ correlation[..., references, column]
+                        seen[key] = over[source.derivatives] @ correlation[..., references, column]
                     total = total + source.factor * seen[key]
                 columns.append(np.swapaxes(np.asarray(total), -2, -1))
             stacked = np.stack(columns, axis=-1)
             return np.asarray(stacked.reshape(*stacked.shape[:-3], -1, len(columns)), dtype=np.float64)
 
-        index = _block_index(len(references), over.centres_s.size, self.blocks.shape[3])
-        return LagMoments(self, over, moments(window.correlation), moments(window.hop_correlation), index)
+        index = _block_index(len(references), centres_s.size, self.blocks.shape[3])
+        return LagMoments(self, centres_s, moments(window.correlation), moments(window.hop_correlation), index)
 
 
 def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
@@ -213,7 +208,7 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     weight = _bin_weights(window) * gain(f, shape) ** 2
     between = window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None]
     shortest_s = SHORTEST_LAG_FROM_S * window.time_scale
-    centres_s = kernels(window.lags_s.tobytes(), shortest_s, shape, formation.deepest).centres_s
+    _, centres_s = kernels(window.lags_s.tobytes(), shortest_s, shape, formation.deepest)
     cosine, sine = _waves(f.tobytes(), float(centres_s[1] - centres_s[0]), centres_s.size)
     flat = between.reshape(f.size, -1)
     # one product for all reference pairs and distances, weighted with the cross-spectra of the pairs of terms
@@ -260,7 +255,7 @@ def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: Floa
     rows, columns = ([window.states.index(name) for name in one.of.references] for one in (a, b))
     weight = _bin_weights(window) * gain(f, a.of.shape) * gain(f, b.of.shape) * density
     between = window.spectrum[:, rows][:, :, columns].conj() * weight[:, None, None]
-    ours, theirs = a.kernels.centres_s, b.kernels.centres_s
+    ours, theirs = a.centres_s, b.centres_s
     distances_s = np.concatenate([ours[0] - theirs[:0:-1], ours - theirs[0]])
     found = (between.reshape(f.size, -1).T @ np.exp(2j * np.pi * f[:, None] * distances_s)).real
     distance = np.arange(ours.size)[:, None] - np.arange(theirs.size) + theirs.size - 1

@@ -123,9 +123,10 @@ def learn_baseline(
     consistency: list[LeftOut] = []
     for row in learned:
         relation, contributions, reason = _learn(row, windows, states)
-        growth.append(None if relation is None else growth_of(row, relation, [one.moments for one in contributions]))
+        moments = [one for one, _ in contributions]
+        growth.append(None if relation is None else growth_of(row, relation, moments))
         if relation is not None:
-            found = left_out(row, [one.moments for one in contributions], groups)
+            found = left_out(row, moments, groups)
             relation = replace(relation, allowance=allowance_of(found))
             consistency += found
         relations.append(relation)
@@ -157,7 +158,7 @@ def _learned_under(
     if len(known) < len(relations) or len(set(groups)) > 1:
         return NO_FORCE
     by_window = zip(*parts, strict=True)
-    found = [force_spectrum([one.moments.of for one in rows], known) for rows in by_window]
+    found = [force_spectrum([moments.of for moments, _ in rows], known) for rows in by_window]
     if len({one.shape for one in found}) > 1:
         return NO_FORCE
     return np.asarray(np.mean(found, axis=0), dtype=np.float64)
@@ -215,9 +216,9 @@ def _covariance(
         for j, second in enumerate(relations[:i]):
             if second is None:
                 continue
-            for a, b in zip(parts[i], parts[j], strict=True):
-                between = shared_covariance(a.moments, first.combination, b.moments, second.combination)
-                total[slices[i], slices[j]] += a.projection @ between @ b.projection.T
+            for (a, of_a), (b, of_b) in zip(parts[i], parts[j], strict=True):
+                between = shared_covariance(a, first.combination, b, second.combination)
+                total[slices[i], slices[j]] += of_a @ between @ of_b.T
             total[slices[j], slices[i]] = total[slices[i], slices[j]].T
     return positive(total)
 

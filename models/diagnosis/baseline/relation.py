@@ -168,12 +168,8 @@ class Relation:
         return np.concatenate([[1.0], -self.coefficients])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Contribution:
-    """Contribution of one healthy window to the coefficients of a row."""
-
-    moments: LagMoments
-    projection: FloatArray  # (n_coefficients, n_moments), from its moments to the coefficients
+Contribution = tuple[LagMoments, FloatArray]
+"""Moments of one healthy window, and the projection, (n_coefficients, n_moments), from them to a row's coefficients."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,7 +347,7 @@ def learn_row(
     for part in parts:
         W, kept = inverse(part.covariance(relation.combination))
         projection = stretch @ covariance @ part.values[:, 1:].T @ W / part.widening(relation.combination, W, kept)
-        contributions.append(Contribution(part, projection))
+        contributions.append((part, projection))
     return relation, contributions
 
 

@@ -13,7 +13,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import IDENTITY, STRUCTURAL, Sides, SpectralModel, packed, twice_packed
 from models.diagnosis.misfit import ACROSS, DELAY, EACH_LATE, UNEQUAL, AlternativeTest, Goodness
@@ -48,7 +47,7 @@ def goodness_of_fit(
         if sure
     )
     mismatches = model.motions.mismatches(states, model.centre, weights.averages)
-    pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
+    pairs = [_named(*mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
     # The two gains of a pair are nearly one test, and a pair's mismatch is hardly random; the total excess adds one.
     tests = len(alternatives) - len(pairs) + 1
     total, expected, scatter = total_excess(model, weights, found)
@@ -86,13 +85,15 @@ def beyond_parameters(
     return score, left, left > _LEAST_INFORMATION * alone, imitated
 
 
-def _named(mismatch: Mismatch, alternatives: dict[str, AlternativeTest]) -> AlternativeTest:
+def _named(
+    states: tuple[str, str], change: float, z: float, alternatives: dict[str, AlternativeTest]
+) -> AlternativeTest:
     """Attribute a mismatch of displacement and velocity to the one whose gain explains the window better."""
-    x, v = (f"gain of {state}" for state in mismatch.states)
+    x, v = (f"gain of {state}" for state in states)
     z_x, z_v = (abs(alternatives[name].z) if name in alternatives else 0.0 for name in (x, v))
     if z_x > z_v:
-        return AlternativeTest(x, mismatch.z, 1 / (1 + mismatch.change) - 1, mismatch.states)
-    return AlternativeTest(v, mismatch.z, mismatch.change, mismatch.states)
+        return AlternativeTest(x, z, 1 / (1 + change) - 1, states)
+    return AlternativeTest(v, z, change, states)
 
 
 def _alternatives(model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:

@@ -166,15 +166,6 @@ _ABSENT = -1
 _GAIN_FLOOR = 0.005  # error of a pair's gain that no window length removes: unequal noise and leakage look like it
 
 
-@dataclass(frozen=True, slots=True)
-class Mismatch:
-    """How far the displacement and the velocity of one degree of freedom disagree."""
-
-    states: tuple[str, str]  # displacement and velocity
-    change: float  # gain of the velocity relative to that of the displacement, minus one
-    z: float  # the same in standard errors
-
-
 class Motions:
     """Measured degrees of freedom, and how the measured states combine into them.
 
@@ -248,8 +239,13 @@ class Motions:
             left[:, at] = (of_v + r[:, at] ** 2 * of_x - 2 * r[:, at] * between.imag) / (1 + r[:, at] ** 2)
         return left
 
-    def mismatches(self, states: ComplexArray, w: FloatArray, averages: FloatArray) -> list[Mismatch]:
+    def mismatches(
+        self, states: ComplexArray, w: FloatArray, averages: FloatArray
+    ) -> list[tuple[tuple[str, str], float, float]]:
         """Compare displacement and velocity of every degree of freedom that has both.
+
+        With the two states comes the gain of the velocity relative to that of the displacement, minus one, and the same
+        in standard errors.
 
         With gains 1 and 1 + δ, the rest d = (v - jr x)/√(1 + r²) of a pair contains jr δ z/(1 + r²) of its motion z. A
         least-squares regression gives δ, and its residual the standard error.
@@ -273,9 +269,7 @@ class Motions:
         noise = averages @ (regressor**2 * dd) / total
         error = np.sqrt(averages @ (power * dd) / 2 / total**2 + noise**2 + _GAIN_FLOOR**2)
         pairs = [(self.states[i], self.states[j]) for i, j in zip(x.tolist(), v.tolist(), strict=True)]
-        return [
-            Mismatch(pair, *each) for pair, *each in zip(pairs, delta.tolist(), (delta / error).tolist(), strict=True)
-        ]
+        return list(zip(pairs, delta.tolist(), (delta / error).tolist(), strict=True))
 
 
 def integrated(window: WindowStatistics) -> WindowStatistics:

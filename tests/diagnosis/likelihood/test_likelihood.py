@@ -490,7 +490,7 @@ def test_shares_of_a_motion_add_up_to_one() -> None:
 def test_a_wrong_gain_shows_as_a_mismatch_of_its_pair(gain: float) -> None:
     motions = Motions(STATES, SCALE)
     states = spectra(np.array(1e-10), np.full(3, 1e-3), gains=(1.0, 1.0, gain))
-    (found,) = motions.mismatches(states, W, np.full(W.size, 11.0))
-    assert found.states == ("y1", "y1_dot")
-    assert found.change == pytest.approx(gain - 1, abs=0.02)
-    assert (abs(found.z) > 5) == (gain != 1.0)
+    ((pair, change, z),) = motions.mismatches(states, W, np.full(W.size, 11.0))
+    assert pair == ("y1", "y1_dot")
+    assert change == pytest.approx(gain - 1, abs=0.02)
+    assert (abs(z) > 5) == (gain != 1.0)
