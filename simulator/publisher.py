@@ -24,7 +24,6 @@ import zenoh.ext
 
 from models.errors import MachineFileError, RotorwatchError
 from models.machine import MachineFile
-from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
@@ -80,8 +79,15 @@ def publish(
         probe = session.declare_publisher(machine.keys.stream)
 
         def wait_for_subscriber() -> None:
-            if settings.wait_for_subscriber_s is not None:
-                _wait_for_subscriber(session, probe, machine.keys, settings, stop)
+            timeout_s, began_s = settings.wait_for_subscriber_s, time.monotonic()
+            while timeout_s is not None and not _heard(probe) and not stop.wait(_POLL_S):
+                if time.monotonic() - began_s > timeout_s:
+                    why = ""
+                    if session.info.peers_zid() or session.info.routers_zid():
+                        why = ": is a monitor of this machine there, and may this program publish it?"
+                    elif settings.link.connect:
+                        why = f": {settings.link.refusal()}"
+                    raise PublishError(f"nobody subscribed to {machine.keys.stream} within {timeout_s:g} s{why}")
 
         def held() -> BlockStream:
             for item in stream:
@@ -167,23 +173,6 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
 
 def _heard(probe: zenoh.Publisher) -> bool:
     return bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
-
-
-def _wait_for_subscriber(
-    session: zenoh.Session, probe: zenoh.Publisher, keys: MachineKeys, settings: PublishSettings, stop: Event
-) -> None:
-    link, timeout_s = settings.link, settings.wait_for_subscriber_s or 0.0
-    deadline = time.monotonic() + timeout_s
-    while not _heard(probe):
-        if stop.wait(_POLL_S):
-            break
-        if time.monotonic() > deadline:
-            why = ""
-            if session.info.peers_zid() or session.info.routers_zid():
-                why = ": is a monitor of this machine there, and may this program publish it?"
-            elif link.connect:
-                why = f": {link.refusal()}"
-            raise PublishError(f"nobody subscribed to {keys.stream} within {timeout_s:g} s{why}")
 
 
 def _send(

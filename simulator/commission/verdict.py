@@ -4,13 +4,10 @@ import math
 from collections.abc import Iterable
 
 from models.commissioning.commission import CommissioningReport, ParameterSummary
+from models.diagnosis.baseline.rows import PLACES
 from models.levels.limits import MEASURE_WORDS
 
-_PLACES = {
-    "y1": "bearing, horizontal",
-    "y2": "disc, horizontal",
-    "z1": "bearing, vertical",
-    "z2": "disc, vertical",
+_PLACES = PLACES | {
     "psi": "disc tilt, horizontal",
     "phi": "disc tilt, vertical",
     "theta": "shaft angle (phase reference)",

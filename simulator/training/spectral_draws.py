@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.networks.amortised import NEAR, around
-from models.diagnosis.networks.features import ForceFeatures, principal_directions
+from models.diagnosis.networks.features import ForceFeatures, condensed, principal_directions
 from models.diagnosis.window.moments import plan_for
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix, changed
@@ -273,20 +273,19 @@ class FeatureDraws:
     def _windows(
         self, rng: np.random.Generator, draws: SpectralDraws, conditions: DrawnConditions
     ) -> list[Float32Array]:
-        speed, n_kept = conditions.speed_rad_s, self.directions.shape[2]
+        speed = conditions.speed_rad_s
         through = list(_centres(self.machine, conditions.centre, self.near))
         features = through[0][1]
         expected = np.concatenate([one.force(conditions.spectrum[own]) for own, one in through])
         centre = conditions.centre.astype(np.float32)[:, : len(PARAMETERS) if self.near else 0]
         agreement = features.consistency(conditions.spectrum, speed)
-        n_speed = 1
         windows: list[Float32Array] = []
         for force in draws.realisations(rng, expected, speed, _REALISATIONS):
-            series = (features.series(force) - self.mean) @ self.directions
-            scores = series.transpose(1, 0, 2).reshape(speed.size, features.n_series * n_kept)
+            scores = condensed(features.series(force), self.mean, self.directions)
             seen = agreement.copy()
-            seen[:, n_speed:] += _CONSISTENCY_ERROR * rng.standard_normal(seen[:, n_speed:].shape, dtype=np.float32)
-            parts: list[Float32Array] = [np.asarray(scores, dtype=np.float32), centre, seen]
+            # The first feature is the speed.
+            seen[:, 1:] += _CONSISTENCY_ERROR * rng.standard_normal(seen[:, 1:].shape, dtype=np.float32)
+            parts = [scores, centre, seen]
             if features.has_angle:
                 vectors = draws.scattered_vectors(rng, conditions)
                 seen_1x = [one.unbalance(conditions.spectrum[own], vectors[own], speed[own]) for own, one in through]

@@ -22,7 +22,7 @@ from models.physics.rotor import PARAMETERS
 
 ORDERS = ("", "_dot", "_ddot")  # endings of the state variable's name by order of the derivative that is measured
 
-_PLACES = {"y1": "bearing, horizontal", "y2": "disc, horizontal", "z1": "bearing, vertical", "z2": "disc, vertical"}
+PLACES = {"y1": "bearing, horizontal", "y2": "disc, horizontal", "z1": "bearing, vertical", "z2": "disc, vertical"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def lowest(coordinate: str, states: Sequence[str]) -> int | None:
 def not_measured(motions: Sequence[Motion], states: Sequence[str]) -> str:
     """Sentence on the coordinates of these motions that are not measured; empty if all are."""
     coordinates = dict.fromkeys(motion.coordinate for motion in motions)
-    places = [_PLACES[coordinate] for coordinate in coordinates if not _measured(coordinate, states)]
+    places = [PLACES[coordinate] for coordinate in coordinates if not _measured(coordinate, states)]
     missing = "; ".join(f"{place} (displacement, velocity or acceleration)" for place in places)
     return f"not measured: {missing}" if missing else ""
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 from scipy.linalg import block_diag
 
-from models.diagnosis.networks.features import FeatureBasis, ForceFeatures
+from models.diagnosis.networks.features import FeatureBasis, ForceFeatures, condensed
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, not_determined, parameter_reading
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
@@ -141,7 +141,7 @@ class NetworkDiagnostician:
             synchronous = None if synchronous is None else synchronous[columns]
         speed = np.array([window.speed_rad_s])
         series = features.series(features.force(spectrum))
-        parts = [basis.condensed(series), centre, features.consistency(spectrum, speed)]
+        parts = [condensed(series, basis.mean, basis.directions), centre, features.consistency(spectrum, speed)]
         if synchronous is not None and basis.centre.size > basis.n_common:
             parts.append(features.unbalance(spectrum, synchronous[None], speed))
         return basis.standardised(np.concatenate(parts, axis=1)), series

@@ -222,11 +222,6 @@ class FeatureBasis:
         """Number of inputs that all networks share."""
         return int(self.precision_factor.shape[0])
 
-    def condensed(self, series: Float32Array) -> Float32Array:
-        """Principal-component scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
-        scores = (series - self.mean) @ self.directions
-        return np.asarray(scores.transpose(1, 0, 2).reshape(series.shape[1], -1), dtype=np.float32)
-
     def standardised(self, raw: Float32Array) -> Float32Array:
         """Inputs less their mean, in units of their standard deviation; `raw` may lack those for equation 29."""
         n = raw.shape[1]
@@ -236,6 +231,12 @@ class FeatureBasis:
         """Squared Mahalanobis distance from the training windows, per input, shape (n_windows,); usually about 1."""
         n = self.n_common
         return np.asarray(np.mean((inputs[:, :n] @ self.precision_factor) ** 2, axis=1), dtype=np.float64)
+
+
+def condensed(series: Float32Array, mean: Float32Array, directions: Float32Array) -> Float32Array:
+    """Principal-component scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
+    scores = (series - mean) @ directions
+    return np.asarray(scores.transpose(1, 0, 2).reshape(series.shape[1], -1), dtype=np.float32)
 
 
 def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Array, Float32Array]:
