@@ -181,7 +181,6 @@ def _beside(options: Options, case: int, _: None, number: int) -> Iterator[dict[
 def _level(levels: WindowLevels, name: str) -> FloatArray:
     if name != "bands":
         return levels.values[name]
-    assert levels.bands is not None  # noqa: S101  # for the type checker
     return levels.bands.rms
 
 

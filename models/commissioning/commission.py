@@ -272,7 +272,7 @@ def commission(
     commissioned = None
     if pieces and not refused:
         channels = [machine.sensors[column] for column in recordings[0].plan.columns]
-        bands = [[p.levels.bands for p in pieces if p.recording == one.name and p.levels.bands] for one in recordings]
+        bands = [[p.levels.bands for p in pieces if p.recording == one.name] for one in recordings]
         # Without a theory, only lines that can be taken out of correlations are excluded.
         everywhere = knowledge.level is not KnowledgeLevel.NONE
         excluded = [(line, one) for one in windows for line in one.lines if everywhere or line.power is not None]

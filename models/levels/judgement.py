@@ -113,7 +113,7 @@ class LevelJudge:
         """
         relative = None if reference is None else self._relative_limits(levels, reference)
         grown: Sequence[Growth | None] = [None] * len(self._channels)
-        if relative is not None and relative.bands is not None and levels.bands is not None and not moved:
+        if relative is not None and relative.bands is not None and not moved:
             grown = growth(levels.bands, relative.bands)
         grown = [None if column in missing else one for column, one in enumerate(grown)]
         told = np.full(len(grown), True)  # which 2x are compared
@@ -164,7 +164,7 @@ class LevelJudge:
             names = [one.name for one in self._channels]
             by_theory = {} if state.levels else {"unlike": "no rotor of the machine file makes"}
             found = found or new_line(levels, names, state.lines, state.bands, **by_theory)
-        if not found and reference.gains is not None and levels.bands is not None:
+        if not found and reference.gains is not None:
             places = [place_of(one) for one in self._channels]
             wrong = wrong_gain(levels.bands, places, reference.gains)
             if wrong is not None:
@@ -250,7 +250,7 @@ class LevelJudge:
         The loss of a line explains a kurtosis that has risen to no more than a Gaussian's 3.
         """
         name, kurtosis = self._channels[column].name, levels.random_kurtosis
-        if kurtosis is None or levels.moments is None or levels.bands is None:
+        if kurtosis is None or levels.moments is None:
             return 0.0
         hops, healthy = kurtosis[:, column], state.kurtosis[name]
         found = departure(hops, healthy, n_errors)

@@ -104,7 +104,7 @@ def relative_limits(
         limits.append(of_channel)
         regions.append(region)
     bands = None
-    if seen and levels.bands is not None:  # at a speed that was never seen lines are elsewhere
+    if seen:  # at a speed that was never seen lines are elsewhere
         own = [state.bands.get(channel.name) for channel in channels]
         bands = band_limits(levels.bands, own, given.alert_ratio, shorter)
     return RelativeLimits(source, tuple(limits), tuple(regions), bands)

@@ -96,7 +96,7 @@ def new_line(
         Relative clause of the text: what has or makes no such line.
     """
     bands, parts = levels.bands, levels.line_parts
-    if bands is None or parts is None or levels.moments is None:
+    if parts is None or levels.moments is None:
         return ""
     known = [name in healthy_bands and len(healthy_bands[name].low) == len(parts) for name in channels]
     if not all(known) or any(len(healthy_parts.get(name, ())) != len(parts) for name in channels):

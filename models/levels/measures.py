@@ -284,9 +284,9 @@ class WindowLevels:
     # (n,), standard errors, from the scatter of the hops, of the measures in `COMPARED`; empty if not asked for.
     errors: Mapping[str, FloatArray]
     vectors: ComplexArray | None  # (4, n), mean of q of the hops at the orders, with a phase reference
+    bands: BandLevels
     speed_rad_s: float | None = None  # mean; None where it is not known
     hops: int = 1
-    bands: BandLevels | None = None
     lines: FloatArray | None = None  # (n_hops, n_bands, n), mean squares of each band's strongest bin, if looked for
     speeds_rad_s: FloatArray | None = None  # (n_hops,), NaN where it is not known
     # Of each hop: second and fourth moments, whole orders (all for `random_kurtosis`), mean squares in the bands.
@@ -299,7 +299,7 @@ class WindowLevels:
 
         The copy serves to learn a reference and to detect faults; errors, vectors and lines stay.
         """
-        if not columns or self.bands is None:
+        if not columns:
             return self
         gone = np.isin(np.arange(self.bands.rms.shape[1]), columns)
         lone = gone.copy()
@@ -340,7 +340,7 @@ class WindowLevels:
 
         With a phase reference that level follows from the steps of 2x between hops, otherwise from the bands around it.
         """
-        if self.moments is None or self.speed_rad_s is None or self.bands is None or self.hops < _LEAST_HOPS:
+        if self.moments is None or self.speed_rad_s is None or self.hops < _LEAST_HOPS:
             return None
         known = self.moments[2][~np.isnan(self.moments[2][:, 1]).any(axis=1), 1]
         if self.vectors is not None:
@@ -418,7 +418,7 @@ def window_levels(
     lines = np.stack([hop.lines for hop in hops]) if plan.lines else None
     moments = sums[:, 7], sums[:, 3] - sums[:, 6], every_order[:, 1:], in_bands
     contact = sums[:, CONTACT]
-    return WindowLevels(values, scatter, vectors, speed_rad_s, count, bands, lines, speeds_rad_s, moments, contact)
+    return WindowLevels(values, scatter, vectors, bands, speed_rad_s, count, lines, speeds_rad_s, moments, contact)
 
 
 def _mean(values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:

@@ -132,7 +132,7 @@ def expected_levels(
     """
     bands, parts = {}, {}
     nothing = HopReference(mean=_UNTOUCHED, scatter=_UNTOUCHED_SCATTER, hops=_BY_THEORY, range=_OF_MEANS)
-    if levels.bands is not None and levels.lines is not None:
+    if levels.lines is not None:
         edges_hz, none = tuple(levels.bands.edges_hz.tolist()), (0.0,) * len(levels.bands.freedom)
         freedom = tuple(levels.bands.freedom.tolist())
         silent = BandReference(edges_hz=edges_hz, mean=none, high=none, low=none, error=none, freedom=freedom)
@@ -151,10 +151,9 @@ def _speed(levels: WindowLevels) -> float:
 
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
-    bands = [one.bands for one in group if one.bands is not None]
     looked, lines = [parts for one in group if (parts := one.line_parts) is not None], np.empty((0, 0))
-    if bands and len(looked) == len(group):
-        lines = learn_lines(looked, bands[0], group[0].hops, max(one.unsteady for one in group))
+    if len(looked) == len(group):
+        lines = learn_lines(looked, group[0].bands, group[0].hops, max(one.unsteady for one in group))
     kurtosis, contact = [one.random_kurtosis for one in group], [one.contact for one in group]
     return OperatingState(
         windows=len(group),
@@ -168,7 +167,7 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         bands={
             channel: learn_bands(own, column)
             for column, channel in enumerate(channels)
-            if len(bands) == len(group) and (own := [one for one in bands if np.isfinite(one.rms[:, column]).all()])
+            if (own := [one.bands for one in group if np.isfinite(one.bands.rms[:, column]).all()])
         },
         lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),  # of all channels, or none
         kurtosis=_hops(channels, kurtosis),
@@ -191,7 +190,7 @@ def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict
 
 def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> ReferenceLevel | None:
     # Without the windows in which the sensor, or its partner of a pair, was not connected.
-    levels = [one for one in levels if one.bands is None or np.isfinite(one.bands.rms[:, column]).all()]
+    levels = [one for one in levels if np.isfinite(one.bands.rms[:, column]).all()]
     if name == "s_max":
         levels = [one for one in levels if np.isfinite(one.values[name][column])]
     values = np.array([one.values[name][column] for one in levels])
@@ -279,7 +278,6 @@ class FirstWindows:
             **{
                 f"{name}_{number}": getattr(one.bands, name)
                 for number, one in enumerate(seen)
-                if one.bands is not None
                 for name in ("edges_hz", "rms", "errors", "freedom")
             },
             **{f"vectors_{number}": none if one.vectors is None else one.vectors for number, one in enumerate(seen)},
@@ -309,16 +307,15 @@ class FirstWindows:
         seen = []
         for n, speed in enumerate(speeds.tolist()):
             vectors = checked(arrays, f"vectors_{n}", np.complex128, (None, None))
-            given = forms if f"rms_{n}" in arrays else {}
-            bands = {name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in given.items()}
+            bands = {name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in forms.items()}
             seen.append(
                 WindowLevels(
                     dict(zip(COMPARED, values[n], strict=True)),
                     dict(zip(COMPARED, errors[n], strict=True)),
                     vectors if vectors.size else None,
+                    BandLevels(**bands),
                     speed if math.isfinite(speed) else None,
                     hops[n],
-                    BandLevels(**bands) if bands else None,
                 )
             )
         end_ns = int(checked(arrays, "end_ns", np.int64, ()))

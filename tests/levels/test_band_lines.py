@@ -112,7 +112,7 @@ def test_a_line_hidden_by_noise_or_unsteady_speed_at_commissioning_is_not_new() 
 
 def test_without_lines_at_commissioning_none_are_reported(healthy: list[WindowLevels]) -> None:
     assert level_plan(CHANNELS, RATE_HZ, (10.0, 1000.0)).lines is False
-    without = [type(one)(one.values, one.errors, one.vectors, one.speed_rad_s, one.hops, one.bands) for one in healthy]
+    without = [type(one)(one.values, one.errors, one.vectors, one.bands, one.speed_rad_s, one.hops) for one in healthy]
     assert told(window(600, loud=0.3, mesh=0.4), without) == ""
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from models.levels.bands import BandLevels
 from models.levels.contact import LatestContact, contact
 from models.levels.judgement import LevelJudge
 from models.levels.kurtosis import HopReference
@@ -147,6 +148,7 @@ def test_unusable_signals_show_no_contact(change: str) -> None:
 
 
 WINDOW, LATEST = 12, 48
+SILENT = BandLevels(np.array([1.0, 2.0]), np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1))
 PAIR = [channel("displacement", way) for way in "yz"]
 HEALTHY = HopReference(mean=0.0, scatter=1.0, hops=144, range=0.5)
 
@@ -169,7 +171,7 @@ def heard(
     found = []
     for end in range(window, len(hops) + 1):
         speed_rad_s = 100.0 if faster is None or end <= faster else 200.0
-        levels = WindowLevels({}, {}, None, speed_rad_s, window, contact=hops[end - window : end])
+        levels = WindowLevels({}, {}, None, SILENT, speed_rad_s, window, contact=hops[end - window : end])
         if end == stop:
             arrays, latest = latest.checkpoint(), LatestContact(LATEST)
             latest.restore(arrays)
@@ -192,7 +194,7 @@ def test_a_light_contact_is_reported_after_some_minutes_and_stays_reported() -> 
 
 def test_theory_allows_for_what_slow_modes_and_noise_show() -> None:
     """A healthy rotor of 4 kg whose lowest modes, at 11 Hz, ring for 2 s has such hops at its bearing."""
-    levels = WindowLevels({}, {}, None, 100.0, WINDOW, contact=np.zeros((WINDOW, 2)))
+    levels = WindowLevels({}, {}, None, SILENT, 100.0, WINDOW, contact=np.zeros((WINDOW, 2)))
     theory = expected_levels([one.name for one in PAIR], levels, (100.0, 100.0), ())
     for seed in range(20261221, 20261225):
         assert not heard(0.66 + 1.3 * hops_of(seed, 960, 0), reference=theory)

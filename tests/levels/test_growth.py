@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from models.levels.bands import BandLevels
 from models.levels.judgement import LevelJudge, growth_seen
 from models.levels.limits import alerts_of
 from models.levels.measures import COMPARED, WindowLevels, level_plan
@@ -28,7 +29,8 @@ def window(scale: float = 1.0, speed_rad_s: float | None = 150.0, error: float =
     values["velocity"] = scale * np.array([1e-3, np.nan, np.nan])
     values["crest"] = np.full(3, 3.0)
     errors = {name: error * values[name] for name in COMPARED}
-    return WindowLevels(values, errors, None, speed_rad_s, hops=12)
+    silent = BandLevels(np.array([1.0, 2.0]), np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1))
+    return WindowLevels(values, errors, None, silent, speed_rad_s, hops=12)
 
 
 def judged(levels: WindowLevels, reference: LevelReference | None = None, **settings: Any) -> tuple[ChannelLevels, ...]:

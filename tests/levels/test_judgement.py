@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from models.levels.bands import BandLevels
 from models.levels.judgement import LevelJudge, channel_state
 from models.levels.limits import all_rounded
 from models.levels.measures import COMPARED, WindowLevels, level_plan
@@ -31,7 +32,8 @@ def window(
         vectors = np.zeros((4, 1), dtype=np.complex128)
         vectors[1] = x1
     errors = {name: np.array([error]) for name in COMPARED}
-    return WindowLevels(values, errors, vectors, speed_rad_s)
+    silent = BandLevels(np.array([1.0, 2.0]), np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1))
+    return WindowLevels(values, errors, vectors, silent, speed_rad_s)
 
 
 def judged(
