@@ -1,8 +1,9 @@
-"""Samples of a simulated machine, and windows of a stream of blocks, as a monitor makes them."""
+"""Samples of a simulated machine, windows of a stream of blocks, as a monitor makes them, and their theory."""
 
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+import scipy.linalg
 
 from models.diagnosis.window.moments import Plan, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
@@ -19,6 +20,11 @@ def healthy_samples(machine: Machine, duration_s: float, seed: int, *events: Eve
     scenario, _ = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
     return np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
+
+
+def correlation(A: FloatArray, covariance: FloatArray, lag_s: float) -> FloatArray:
+    """R(τ) = E{x(t) xᵀ(t+τ)} = R(0) e^{Aᵀτ} for τ ≥ 0 (Eq. 18); shape (n, n)."""
+    return np.asarray(covariance @ scipy.linalg.expm(A.T * lag_s), dtype=np.float64)
 
 
 def full_windows(window: SlidingWindow, stream: Iterable[SampleBlock]) -> Iterator[WindowStatistics]:

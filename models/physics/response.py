@@ -1,4 +1,4 @@
-"""Response of the rotor: correlation functions from theory (Eqs. 17-25), and exact discretisation (no Euler steps).
+"""Response of the rotor: covariance and steady motion from theory (Eqs. 17-25), and exact discretisation.
 
 References
 ----------
@@ -42,13 +42,6 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     R = scipy.linalg.solve_continuous_lyapunov(A * (deviation / deviation[:, None]), -inputs @ inputs.T)
     R = (R + R.T) / 2 * np.outer(deviation, deviation)
     return np.asarray(R, dtype=np.float64)
-
-
-def correlation(A: FloatArray, covariance: FloatArray, lag_s: float) -> FloatArray:
-    """R(τ) = E{x(t) xᵀ(t+τ)} = R(0) e^{Aᵀτ} for τ ≥ 0, transposed for τ < 0 (Eq. 18); shape (n, n)."""
-    if lag_s < 0:
-        return correlation(A, covariance, -lag_s).T
-    return np.asarray(covariance @ scipy.linalg.expm(A.T * lag_s), dtype=np.float64)
 
 
 def stochastic_covariance(rotor: RotorParameters, speed_rad_s: float, sources: tuple[Source, ...]) -> FloatArray:

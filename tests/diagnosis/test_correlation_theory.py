@@ -6,11 +6,11 @@ import pytest
 from models.diagnosis.window.moments import plan_for
 from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.response import stationary_covariance, synchronous_response
 from models.physics.rotor import STATE_INDEX
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
-from tests.windows import last_window
+from tests.windows import correlation, last_window
 
 LAB = load_machine("lab")
 MACHINE = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0})})

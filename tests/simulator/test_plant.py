@@ -15,12 +15,13 @@ from scipy.integrate import solve_ivp
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.response import stationary_covariance, synchronous_response
 from models.physics.rotor import PARAMETERS, STATE_INDEX, STATES, M_matrix, P_matrix, Q_matrix, Q_shaft, changed
 from models.signals.block import FloatArray
 from simulator.plant import NonlinearPlant, Plant, crack_stiffness, theoretical_moments
 from simulator.scenario import NamedSource, Rub, load_scenario
 from simulator.timeline import Condition
+from tests.windows import correlation
 
 SEEDS = 16
 SECONDS = 20.0

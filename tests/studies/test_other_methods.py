@@ -12,12 +12,13 @@ from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.response import stationary_covariance, synchronous_response
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from simulator.scenario import Scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
+from tests.windows import correlation
 
 LAB = load_machine("lab")
 RIG = with_tilt(LAB)

@@ -7,9 +7,10 @@ from models.diagnosis.networks.equations import EQUATIONS, Equation, StatisticsV
 from models.diagnosis.networks.relation import Network
 from models.machine import Machine, load_machine
 from models.physics.excitation import Source, expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.response import stationary_covariance, synchronous_response
 from models.physics.rotor import PARAMETERS, STATES, changed
 from models.signals.block import FloatArray
+from tests.windows import correlation
 
 LAGS_S = np.arange(60, 126, 3) / 1000  # beyond the memory of a 150 Hz excitation: e^-40
 SOURCES = tuple(

@@ -13,7 +13,7 @@ from scipy.signal import oaconvolve
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import Machine
 from models.physics.excitation import Source, expanded_A, expanded_B
-from models.physics.response import correlation, stationary_covariance
+from models.physics.response import stationary_covariance
 from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import state_name
@@ -40,6 +40,7 @@ from tests.service.analysis.snapshotting import (
     window_of,
 )
 from tests.sure import sure
+from tests.windows import correlation
 
 
 @pytest.mark.parametrize("lagged", [True, False])
