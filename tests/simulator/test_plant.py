@@ -209,12 +209,6 @@ def test_advancing_in_parts_equals_advancing_at_once() -> None:
     np.testing.assert_allclose(np.concatenate([part.theta_rad for part in parts]), whole.theta_rad, atol=1e-12)
 
 
-def test_a_change_of_the_number_of_sources_is_refused() -> None:
-    plant = Plant(LAB, CONDITION, np.random.default_rng(1))
-    with pytest.raises(ValueError, match="0 sources instead of 4"):
-        plant.change(_condition())
-
-
 def test_theoretical_moments_include_the_random_and_the_synchronous_part() -> None:
     squares, stochastic = (np.diag(theoretical_moments(machine, CONDITION)) for machine in (LAB, BALANCED))
     q1, q2 = synchronous_response(LAB.rotor, LAB.operation.speed_rad_s)

@@ -288,6 +288,21 @@ def test_a_source_changes_one_thing_at_a_time() -> None:
     assert source.direction == (0, 0, 0, 0, 1, 0)
 
 
+def test_sources_stay_as_many_in_the_same_order_even_without_force() -> None:
+    """The state of the plant holds that of every source: it would not fit another number of them."""
+    sources = SOURCE, SOURCE.model_copy(update={"name": "bearing z", "direction": (0, 0, 0, 1, 0, 0)})
+    events = (
+        Event(at_s=1.0, source="disc y", force_rms_N=0.0),
+        Event(at_s=2.0, excitation_level=0.0),
+        Event(at_s=3.0, ramp_s=1.0, source="bearing z", cutoff_hz=40.0),
+    )
+    scenario = Scenario(machine="lab", seed=1, duration_s=100.0, sources=sources, events=events)
+    found = {
+        tuple(one.name for one in condition.sources) for _, condition in compile_timeline(scenario, LAB).conditions
+    }
+    assert found == {("disc y", "bearing z")}
+
+
 def test_sensor_faults_add_up_until_none() -> None:
     timeline = _compiled(
         Event(at_s=1.0, sensor="y1", sensor_fault="offset", value_SI=1e-4),
