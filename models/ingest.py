@@ -193,13 +193,7 @@ class Gate:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If they are not a gate's; nothing is changed then.
-        """
+        """Go on where `checkpoint` was called; arrays that are not a gate's change nothing."""
         courses, candidates, refused = (_courses(arrays, name) for name in ("courses", "candidate", "refused"))
         self._expected = courses[-1] if courses else None
         self._earlier = deque(courses[:-1], maxlen=EARLIER_COURSES)

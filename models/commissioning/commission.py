@@ -235,7 +235,8 @@ def commission(
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
     pieces = [] if checks[0].verdict == "refused" else pieces_of(recordings)
-    if (unsuited := check_speed_given(machine, [piece.window for piece in pieces])) is not None:
+    windows = [piece.window for piece in pieces]
+    if (unsuited := check_speed_given(machine, windows)) is not None:
         checks, pieces = [*checks, unsuited], []
     learned, states = Learned(()), states_of(machine)
     if pieces:
@@ -243,13 +244,13 @@ def commission(
         findings = {
             name: [
                 fault
-                for window in windows
+                for window in own
                 for fault in (
                     *sensor_findings(window, None, machine.sensors),
                     *crossed_planes(window, Naming(machine.sensors)),
                 )
             ]
-            for name, windows in by_recording.items()
+            for name, own in by_recording.items()
         }
         if not states:  # levels can also be learned at standstill
             findings = {name: [f for f in found if f.states != ("theta",)] for name, found in findings.items()}
@@ -258,7 +259,7 @@ def commission(
             checks.append(_only_levels(machine, knowledge.text))
         else:
             checks += [check_steady(machine, recordings, by_recording), check_lines(machine, recordings)]
-            in_range = check_speed_range(machine, [piece.window for piece in pieces])
+            in_range = check_speed_range(machine, windows)
             if in_range is not None and knowledge.level is not KnowledgeLevel.NONE:
                 checks.append(in_range)
         if states and all(check.verdict != "refused" for check in checks):
@@ -268,7 +269,6 @@ def commission(
                 learned = Learned((_not_learned(knowledge.level, str(error)),))
             checks += learned.checks
     refused = any(check.verdict == "refused" for check in checks)
-    windows = [piece.window for piece in pieces]
     commissioned = None
     if pieces and not refused:
         channels = [machine.sensors[column] for column in recordings[0].plan.columns]

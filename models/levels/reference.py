@@ -284,13 +284,7 @@ class FirstWindows:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called.
-
-        Raises
-        ------
-        CheckpointError
-            If the arrays are damaged, or of other channels; nothing is changed then.
-        """
+        """Go on where `checkpoint` was called; arrays that are damaged, or of other channels, change nothing."""
         (of,), (text,) = texts(arrays, "of"), texts(arrays, "reference")
         if of != self._of:
             raise CheckpointError("the levels are of other sensors or settings")

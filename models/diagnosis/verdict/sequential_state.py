@@ -57,13 +57,7 @@ class SequentialState:
     def restored(
         cls, arrays: Mapping[str, np.ndarray], hops: Iterable[Mapping[str, np.ndarray]] = ()
     ) -> "SequentialState":
-        """State from what `checkpoint` returned, and the `hops`, oldest first, as `hop_arrays` returned them.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
+        """State from what `checkpoint` returned, and the `hops`, oldest first, as `hop_arrays` returned them."""
         state = cls(before=tuple(checked(arrays, "before", np.float64, (len(PARAMETERS),)).tolist()))
         findings = checked(arrays, "findings", np.int64, (None, 3))
         lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
