@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from models.commissioning.commission import CommissioningReport, ParameterSummary
-from models.commissioning.healthy import HealthyRecording, foreign_lines
+from models.commissioning.healthy import HealthyRecording
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
-from models.diagnosis.window.lines import Line
+from models.diagnosis.window.lines import Line, steady_lines
 from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.signals.block import FloatArray
 from simulator.commission.verdict import channel_text, channel_unit, percent
@@ -254,7 +254,7 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     broken[np.cumsum([len(stretch) for stretch in recording.stretches])[:-1]] = True
     density = np.asarray(np.sqrt(2 * power), dtype=np.float64)
     time_s = (starts - starts[0]) / 1e9 + recording.plan.hop / recording.plan.rate_hz / 2
-    return Portrait(number, statistics, density, time_s, broken, foreign_lines(recording))
+    return Portrait(number, statistics, density, time_s, broken, steady_lines(recording.plan, hops, statistics))
 
 
 def ordered(states: Iterable[str]) -> list[str]:
