@@ -365,10 +365,7 @@ class Machine(MachineFile):
 def load_machine(name_or_path: str | Path) -> Machine:
     """Load the file of a machine whose parameters are known, by path, or a shipped one by its name, such as ``lab``.
 
-    Raises
-    ------
-    MachineFileError
-        Naming the file, the field, the value found and what was expected.
+    Raises `MachineFileError` if it cannot be used.
     """
     path = _path(name_or_path)
     return checked(Machine, read_toml(path), path)
@@ -377,12 +374,7 @@ def load_machine(name_or_path: str | Path) -> Machine:
 def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFile:
     """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
 
-    TOML in `changes` is merged into the file, see `models.mistakes.changed`.
-
-    Raises
-    ------
-    MachineFileError
-        Naming the file, the field, the value found and what was expected.
+    TOML in `changes` is merged into the file, see `models.mistakes.changed`. Raises as `load_machine`.
     """
     path = _path(name_or_path)
     fields = changed(read_toml(path), changes)

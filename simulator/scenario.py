@@ -259,12 +259,7 @@ def shipped_scenarios() -> tuple[str, ...]:
 def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
     """Load a scenario by path, or a shipped one by name, together with the machine it names.
 
-    A path of a machine file is relative to the scenario file.
-
-    Raises
-    ------
-    MachineFileError
-        Naming the file, the field, the value found and what was expected.
+    A path of a machine file is relative to the scenario file. Raises `MachineFileError` if either cannot be used.
     """
     path = _locate(name_or_path, Path())
     fields = _merged(path, ())

@@ -238,12 +238,7 @@ def record(
 
     All times in the file are data time: a block is logged at the time of the sample after its last one, when a real
     machine could have sent it at the earliest. The file is ``.part`` until complete; when `stop` is set, it ends after
-    the current block and is complete.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be written.
+    the current block and is complete. Raises `RecordingError` if it cannot be written.
     """
     keys, schema_hash = machine.keys, machine.descriptor.schema_hash
     begin = time.monotonic()

@@ -349,32 +349,30 @@ def _report(
         if learned.diagnoses
         else ()
     )
-    verdict = "refused"
+    verdict: Literal["commissioned", "limited", "refused"] = "refused"
     growths: Iterable[GrowthToAlert] = ()
     if commissioned is not None:
         verdict = "limited" if any(check.verdict == "limited" for check in checks) else "commissioned"
         if commissioned.levels is not None and machine.levels.reference != "first windows":
             growths = alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops)
-    return CommissioningReport.model_validate(
-        {
-            "site": machine.site,
-            "machine": machine.name,
-            "level": knowledge.level,
-            "level_text": knowledge.text,
-            "verdict": verdict,
-            "summary": _summary(machine, verdict, checks, [one.name for one in parameters if one.evaluable]),
-            "version": 0 if commissioned is None else commissioned.version,
-            "identity": None if commissioned is None else commissioned.identity,
-            "healthy_s": healthy_s,
-            "window_s": machine.window.length_s,
-            "false_alarms_per_month": machine.alarms.false_alarms_per_month,
-            "checks": tuple(checks),
-            "equations": _equations(machine, learned, pieces),
-            "parameters": parameters,
-            "conditions": None if commissioned is None else commissioned.conditions,
-            "levels": tuple(growths),
-            "notes": (*learned.notes, *_misfit_notes(commissioned)),
-        }
+    return CommissioningReport(
+        site=machine.site,
+        machine=machine.name,
+        level=knowledge.level,
+        level_text=knowledge.text,
+        verdict=verdict,
+        summary=_summary(machine, verdict, checks, [one.name for one in parameters if one.evaluable]),
+        version=0 if commissioned is None else commissioned.version,
+        identity=None if commissioned is None else commissioned.identity,
+        healthy_s=healthy_s,
+        window_s=machine.window.length_s,
+        false_alarms_per_month=machine.alarms.false_alarms_per_month,
+        checks=tuple(checks),
+        equations=_equations(machine, learned, pieces),
+        parameters=parameters,
+        conditions=None if commissioned is None else commissioned.conditions,
+        levels=tuple(growths),
+        notes=(*learned.notes, *_misfit_notes(commissioned)),
     )
 
 

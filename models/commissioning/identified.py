@@ -112,13 +112,7 @@ def _settled(
     *,
     sized: bool,
 ) -> Identified:
-    """What is identified from one first guess.
-
-    Raises
-    ------
-    EstimationError
-        If the guess is too far off for the windows to be read, or the parameters do not settle.
-    """
+    """What is identified from one first guess; `EstimationError` if it is too far off to read the windows or settle."""
     diagnoses = [diagnosis for _, diagnosis in _read(whole, windows, sized=sized)]
     for number in range(1, _ROUNDS + 1):
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])

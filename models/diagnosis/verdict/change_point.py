@@ -13,7 +13,6 @@ moment, power and size better than the true ones.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -36,18 +35,13 @@ _MOST = 2  # further parameters that are tried
 _QUANTILES = (0.5, 0.025, 0.975)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Changes:
-    """What the named parameters have changed to, in the scale of the errors, and when."""
-
-    values: FloatArray  # (n_named,)
-    errors: FloatArray  # (n_named,)
-    # Median and 95 % limits of the moment, never closer than half a hop; None where it is before the data.
-    since_ns: tuple[int, int, int] | None
-
-
-def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, by_ns: int) -> Changes:
+def read_changes(
+    windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, by_ns: int
+) -> tuple[FloatArray, FloatArray, tuple[int, int, int] | None]:
     """Estimate the values that the `named` parameters (indices into `PARAMETERS`) have at the end of the latest window.
+
+    With values and errors, in the scale of the errors, come median and 95 % limits of the moment of the change, never
+    closer than half a hop; None where it is before the data.
 
     The windows overlap and hold equally much data, the latest one last; all know the same parameters, and some may
     contain a gap. The parameters had changed by `by_ns` at the latest.
@@ -106,7 +100,7 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     passed = np.cumsum(weight.sum(axis=(0, 1, 3, 4)))
     at = np.minimum(np.searchsorted(passed, _QUANTILES), moments.size - 1)
     middle, low, high = (round(moment) for moment in (moments[at] + np.array([0, -0.5, 0.5]) * hop_ns).tolist())
-    return Changes(mean, np.sqrt(variance), None if middle < starts[0] else (middle, low, high))
+    return mean, np.sqrt(variance), None if middle < starts[0] else (middle, low, high)
 
 
 def _resolution(seen: FloatArray) -> tuple[int, float]:

@@ -161,11 +161,6 @@ class SequentialTest:
             Whether something was seen that no change of a parameter causes.
         rivals : collection of str
             Parameters whose change would explain it as well: if only such are found changed, it need not be foreign.
-
-        Raises
-        ------
-        KeyError
-            If the full window is not among them.
         """
         window_hops = self.settings.window_hops
         own = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}
@@ -374,13 +369,13 @@ class SequentialTest:
         windows = [one for one in self.state.sums[1] if one.known == look.known]
         astride = bool(windows) and windows[-1].end_ns == look.end_ns and windows[-1].start_ns < by_ns - self._slack_ns
         if named and astride:
-            found = read_changes(windows, named, hop_ns, by_ns)
-            self._date(changed, found.since_ns)
+            sizes, spreads, since_ns = read_changes(windows, named, hop_ns, by_ns)
+            self._date(changed, since_ns)
         inside = astride and look.start_ns == windows[-1].start_ns
         if named and not inside:
-            found = read_changes([look], named, hop_ns, look.start_ns)
+            sizes, spreads, _ = read_changes([look], named, hop_ns, look.start_ns)
         for at, i in enumerate(named):
-            value, error = float(found.values[at]), float(found.errors[at])
+            value, error = float(sizes[at]), float(spreads[at])
             if inside and abs(value) < _LEAST_ASTRIDE_ERRORS * error:
                 del read[PARAMETERS[i]]
             else:
