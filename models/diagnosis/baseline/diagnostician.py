@@ -269,16 +269,16 @@ class BaselineDiagnostician:
         coordinates = tuple(sorted({motion.coordinate for one in rows for motion in one.row.motions}))
         healthy, now = self._rotations(coordinates, window)
         cov = self._baseline.covariance
-        observed, to_coefficients, to_d, to_now, to_healthy = relative_force(
-            rows, self._coefficients, bearing.values, now, healthy
-        )
+        force = relative_force(rows, self._coefficients, bearing.values, now, healthy)
+        to_d, to_now, to_healthy = force.to_change, force.to_now, force.to_healthy
         # errors of the coefficients act directly and through the bearing's changes
-        through = to_d @ bearing.sensitivity + to_coefficients
+        through = to_d @ bearing.sensitivity + force.to_coefficients
         extra = bearing.common - bearing.sensitivity @ cov @ bearing.sensitivity.T
         shared = through @ cov @ through.T + to_d @ extra @ to_d.T + to_healthy @ healthy.covariance @ to_healthy.T
         spread = shared + to_d @ bearing.noise @ to_d.T + to_now @ now.covariance @ to_now.T
         shared_with = bearing.sensitivity @ cov @ through.T + extra @ to_d.T
         with_bearing = shared_with + bearing.noise @ to_d.T
+        observed = force.value
         if not (np.all(np.isfinite(observed)) and np.all(np.isfinite(spread))):
             raise EstimationError("no unbalance in the healthy recording")
         design = np.kron(np.eye(2), np.ones((len(rows), 1))).astype(np.float64)

@@ -66,6 +66,18 @@ class ForceRow:
     own: slice  # of its parameters among all changes
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativeForce:
+    """Unbalance force over the healthy one, less one, and its derivatives; real parts of all rows, then imaginary."""
+
+    value: FloatArray  # (2 n_rows,)
+    to_coefficients: FloatArray  # (2 n_rows, n_coefficients), with respect to all relations' coefficients
+    to_change: FloatArray  # (2 n_rows, n_own), with respect to the changes of all own parameters
+    # (2 n_rows, 2 n_coordinates): with respect to the real parts of the synchronous vectors, then the imaginary parts
+    to_now: FloatArray
+    to_healthy: FloatArray
+
+
 def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> SynchronousVectors | None:
     """Synchronous vectors of a window with their covariance; None without a coordinate or a steady speed.
 
@@ -131,12 +143,8 @@ def relative_force(
     change: FloatArray,
     now: SynchronousVectors,
     healthy: SynchronousVectors,
-) -> tuple[FloatArray, ...]:
-    """Unbalance force over the healthy one, less one: ratio of the rows' residuals for present and healthy vectors.
-
-    It has the real parts of all rows, then the imaginary ones, shape (2 n_rows,). Its derivatives follow with respect
-    to all relations' coefficients, to the changes of all own parameters, and to the parts of present and of healthy
-    vectors.
+) -> RelativeForce:
+    """Ratio of the rows' residuals for the present synchronous vectors to those for the healthy ones.
 
     `coefficients`, shape (n_coefficients,), are those of all relations; `change`, shape (n_own,), is the relative
     change of all their own parameters since the machine was healthy.
@@ -166,7 +174,7 @@ def relative_force(
         to_now[number] = np.kron([1, 1j], per_force * (scaled @ terms))
         to_healthy[number] = np.kron([1, 1j], -lost * (combination @ before))
     parts = (ratio - 1, to_coefficients, to_change, to_now, to_healthy)
-    return tuple(np.concatenate([part.real, part.imag]) for part in parts)
+    return RelativeForce(*(np.concatenate([part.real, part.imag]) for part in parts))
 
 
 def _phasors(vectors: SynchronousVectors) -> ComplexArray:
