@@ -446,8 +446,9 @@ def test_a_narrow_resonance_that_bands_divide_is_no_gain_or_lead(seed: int) -> N
     size = round((WINDOW_S + MORE_S) * rate_hz)
     f = np.fft.rfftfreq(size, 1 / rate_hz)
     force = np.fft.rfft(rng.standard_normal(size)) / (1 + (f / 30) ** 4)
-    low, high = (lambda at, f=f: 1 / (at**2 - f**2 + 0.02j * at * f)), 1 / (23.0**2 - f**2 + 1.5j * f)
-    motions = {"y1": low(9.1), "z1": low(9.4), "y2": low(9.1) - 5 * high, "z2": 1.5 * low(9.4) + 4 * high}
+    modes = ((9.1, 0.01), (9.4, 0.01), (23.0, 0.03))
+    y, z, high = (1 / (at**2 - f**2 + 2j * damping * at * f) for at, damping in modes)
+    motions = {"y1": y, "z1": z, "y2": y - 5 * high, "z2": 1.5 * z + 4 * high}
     samples = np.zeros((size, len(plan.states) + 1))
     for state, motion in motions.items():
         for derivatives, name in enumerate((state, f"{state}_dot")):
