@@ -155,7 +155,9 @@ def _too_small(limit: int) -> str:
 def exit_code(error: RotorwatchError) -> int:
     """Exit code: 2 for an unusable file or argument, such as a missing recording; 1 for all other errors."""
     kinds = FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError
-    unusable = isinstance(error, RecordingError | PictureError) and isinstance(error.__cause__, kinds)
+    cause = error.__cause__
+    missing = isinstance(cause, kinds) or (isinstance(cause, OSError) and cause.errno == errno.ENAMETOOLONG)
+    unusable = isinstance(error, RecordingError | PictureError) and missing
     return 2 if unusable or isinstance(error, MachineFileError | BundleError) else 1
 
 

@@ -369,6 +369,9 @@ def test_the_documented_example_is_imported_and_exported(tmp_path: Path) -> None
     assert pyarrow.parquet.read_metadata(out).num_rows == 4000
     second = ("--from", "0.5", "--to-time", "1.5", "--key", "example/fe-rotor", "--overwrite")
     assert f"{out}: 2000 rows" in run("export", recording, "--to", "parquet", "--out", out, *second).stdout
+    refused = run("export", recording, "--to", "parquet", "--out", tmp_path / "none", "--from", "yesterday")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert "--from is 'yesterday', expected seconds after the start of the data, such as 90" in refused.stderr
 
 
 def test_importing_a_folder_with_a_bad_file_exits_1(tmp_path: Path) -> None:

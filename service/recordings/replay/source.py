@@ -130,8 +130,8 @@ class RecordingSource:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        distinct = dict.fromkeys(path.resolve() for path in paths)
-        filled = [file for file in map(summarize_recording, distinct) if file.messages]
+        distinct = {path.resolve(): path for path in paths}
+        filled = [file for file in map(summarize_recording, distinct.values()) if file.messages]
         if not filled:
             raise RecordingError(f"{', '.join(str(path) for path in paths)}: contains no messages")
         self._files = sorted(filled, key=lambda file: (file.start_ns, file.end_ns))

@@ -81,13 +81,12 @@ def test_no_recording_is_not_shown_before_the_list_has_loaded(browser: Browser, 
         held["recordings"].continue_()
         expect(page.locator("recording-table")).to_contain_text("20260101T000000Z.mcap")
         replays = page.locator("replay-list")
-        expect(replays).not_to_be_empty()
-        answered = replays.inner_text()
+        expect(replays).to_contain_text("since the service started")
         load, cut = "document.querySelector('replay-list').load();", "window.fetch = () => Promise.reject('cut');"
         page.evaluate(f"() => {{ const real = window.fetch; {cut} {load} window.fetch = real; }}")
-        expect(replays.get_by_role("status")).to_contain_text("the monitor does not answer")
+        expect(replays).to_contain_text("the monitor does not answer")
         page.evaluate(load)
-        expect(replays).to_have_text(answered)  # the list is back, although it has not changed meanwhile
+        expect(replays).to_contain_text("since the service started")  # again, although the list has not changed
 
 
 def test_a_recording_is_replayed_with_other_settings_and_browsed_by_window(browser: Browser, runtime: Runtime) -> None:
