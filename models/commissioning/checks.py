@@ -229,9 +229,9 @@ def check_recordings(
 ) -> Check | None:
     """Check whether recordings agree, each read against the relations learned from the others; None for a single one.
 
-    `differences` are parameter, its change, and a sentence. If they were made at different speeds, the bearings may
-    depend on the speed, which limits the diagnosis between the speeds. If not, small ones only widen later intervals
-    (`Relation.allowance`).
+    `differences` are parameter, its change, and a sentence. Recordings at different speeds may differ because the
+    bearings depend on the speed, which limits the diagnosis between the speeds. At one speed, differences that matter
+    to no alarm only widen later intervals (`Relation.allowance`).
     """
     told = partial(Check, name="recordings agree")
     if len(speeds_rad_s) < 2:
