@@ -51,9 +51,12 @@ export class LiveElement extends HTMLElement {
     this.#again = this.#loading;
     if (this.#loading || document.hidden) return;
     this.#loading = true;
-    this.answered = await this.attempt(() => this.ask());
-    this.#loading = false;
-    if (this.#again && this.isConnected) this.load();
+    try {
+      this.answered = await this.attempt(() => this.ask());
+    } finally {
+      this.#loading = false;
+      if (this.#again && this.isConnected) this.load();
+    }
   }
 
   /**
