@@ -205,7 +205,10 @@ class AlarmBook:
             note = "; ".join(filter(None, (unexplained, suspect and f"best explained by: {suspect}", at_once, just)))
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
         heard = any(self._alarms[one].due for one in (*probability, CHANGED) if one in self._alarms)
-        return bool(unreserved) and heard and not (outside or hidden or rival)
+        standing = any(self.present(one) and not self._alarms[one].low_confidence for one in PARAMETERS)
+        # After a repair, the window still holds data from before.
+        explained = (unreserved and heard) or (standing and not verdict.settled)
+        return bool(explained) and not (outside or hidden or rival)
 
     def update(  # noqa: PLR0913  # what one reading says
         self,

@@ -276,6 +276,20 @@ def test_stiffening_or_small_changes_explain_no_levels_and_a_repaired_shaft_clea
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("outside", "unsettled"), [(False, True), (True, False)])
+def test_a_repaired_parameter_explains_levels_while_the_window_holds_data_from_before(
+    *, outside: bool, unsettled: bool
+) -> None:
+    book = AlarmBook(SETTINGS)
+    found = verdict({"k_by": 0.99}, change=-0.3)
+    repaired = verdict({"k_by": 0.0}, change=-0.3).model_copy(update={"outside_model": outside})
+    told = [book.found(found, "", "", number * 5_000_000_000) for number in range(4)]
+    for number, settled in enumerate((False, False, True, True), start=4):
+        one = repaired.model_copy(update={"settled": settled})
+        told.append(book.found(one, "", "", number * 5_000_000_000))
+    assert told == [True] * 4 + [unsettled] * 2 + [False] * 2
+
+
 @pytest.mark.parametrize(
     ("others", "by", "settled", "reserve"),
     [
