@@ -267,7 +267,7 @@ class BaselineDiagnostician:
         if reversed_within := reversed_signs(window):
             raise EstimationError(reversed_within)
         coordinates = tuple(sorted({motion.coordinate for one in rows for motion in one.row.motions}))
-        healthy, now = self._rotations(coordinates, window)
+        healthy, now = self._rotations(coordinates, window, rows)
         cov = self._baseline.covariance
         force = relative_force(rows, self._coefficients, bearing.values, now, healthy)
         to_d, to_now, to_healthy = force.to_change, force.to_now, force.to_healthy
@@ -308,9 +308,10 @@ class BaselineDiagnostician:
         return np.append(bearing.values, size - 1), both, common, slopes
 
     def _rotations(
-        self, coordinates: tuple[str, ...], window: WindowStatistics
+        self, coordinates: tuple[str, ...], window: WindowStatistics, rows: Sequence[ForceRow]
     ) -> tuple[SynchronousVectors, SynchronousVectors]:
-        now = rotation_of(window, coordinates)
+        relations = [(one.row, np.append(1.0, -self._coefficients[one.coefficients])) for one in rows]
+        now = rotation_of(window, coordinates, relations)
         if not self._baseline.rotations:
             raise EstimationError("the baseline has no phase reference and no speed found in the vibration")
         if now is None:

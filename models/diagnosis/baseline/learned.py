@@ -138,7 +138,9 @@ def learn_baseline(
     there = {relation.row for relation in relations if relation is not None}
     used = [row for row in rows if row.rests_on in there]
     coordinates = tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
-    rotations = [rotation_of(window, coordinates) for window in windows]
+    known = [(row, one.combination) for row, one in zip(learned, relations, strict=True) if one is not None]
+    known = [(row, combination) for row, combination in known if any(other.rests_on == row.name for other in used)]
+    rotations = [rotation_of(window, coordinates, known) for window in windows]
     return Baseline(
         relations=tuple(relations),
         reasons=tuple(reasons),

@@ -78,10 +78,16 @@ class RelativeForce:
     to_healthy: FloatArray
 
 
-def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> SynchronousVectors | None:
+def rotation_of(
+    window: WindowStatistics, coordinates: tuple[str, ...], relations: Sequence[tuple[Row, FloatArray]]
+) -> SynchronousVectors | None:
     """Synchronous vectors of a window with their covariance; None without a coordinate or a steady speed.
 
     If the speed was estimated from the vibration, angles relative to the shaft are not known.
+
+    The errors are those of the forces: what the frequencies beside the speed leave in a relation, each at its own
+    frequency, is nearly the same as at the speed, however near a resonance is. `relations` are rows with the
+    combination of their terms, shape (n_terms,), that is left.
     """
     measured = _synchronous(window)
     if measured is None or not coordinates or not np.isfinite(window.speed_rad_s) or window.speed_rad_s == 0:
@@ -99,8 +105,12 @@ def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Synch
     near = (distance >= _NEIGHBOURS[0]) & (distance <= _NEIGHBOURS[1])
     if not np.any(near):
         return None
-    density = window.spectrum[near][:, columns][:, :, columns].mean(axis=0) * (2 / window.duration_s)
-    density = density * np.outer(to_displacement, to_displacement.conj())
+    w = 2 * np.pi * window.frequencies_hz[near]
+    at_speed, beside = (_left(relations, coordinates, speed) for speed in (np.array(window.speed_rad_s), w))
+    seen = np.eye(len(columns)) + np.linalg.pinv(at_speed) @ (beside - at_speed)
+    seen = seen * ((1j * w[:, None]) ** -np.array(known, dtype=np.float64))[:, None, :]
+    density = seen @ window.spectrum[near][:, columns][:, :, columns] @ seen.conj().swapaxes(1, 2)
+    density = density.mean(axis=0) * (2 / window.duration_s)
     # q = a - jb with the phase of cos θ, so its density is that of the Fourier transform
     covariance = np.block([[density.real, -density.imag], [density.imag, density.real]])
     absolute = window.synchronous is not None
@@ -160,7 +170,7 @@ def relative_force(
         factors = np.ones((len(one.row.own), combination.size))
         for factor, own, value in zip(factors, one.row.own, change[one.own], strict=True):
             factor[list(own.terms)] = 1 + value
-        terms, before = _terms(one.row, now), _terms(one.row, healthy)
+        terms, before = (_terms(one.row, at.coordinates, np.array(at.speed_rad_s)) for at in (now, healthy))
         moved, moved_before = terms @ _phasors(now), before @ _phasors(healthy)
         per_force = (healthy.speed_rad_s / now.speed_rad_s) ** 2 / (combination @ moved_before)
         scaled = combination * factors.prod(axis=0)
@@ -182,13 +192,20 @@ def _phasors(vectors: SynchronousVectors) -> ComplexArray:
     return np.asarray(vectors.vectors[:n] + 1j * vectors.vectors[n:], dtype=np.complex128)
 
 
-def _terms(row: Row, vectors: SynchronousVectors) -> ComplexArray:
-    """A row's terms as combinations of the coordinates' displacements, shape (n_terms, n_coordinates)."""
-    speed = vectors.speed_rad_s
-    terms = np.zeros((len(row.terms), len(vectors.coordinates)), dtype=np.complex128)
-    for found, term in zip(terms, row.terms, strict=True):
+def _left(
+    relations: Sequence[tuple[Row, FloatArray]], coordinates: tuple[str, ...], speed_rad_s: FloatArray
+) -> ComplexArray:
+    """What displacements leave in relations, shape (*speed.shape, n_relations, n_coordinates)."""
+    return np.stack([combination @ _terms(row, coordinates, speed_rad_s) for row, combination in relations], axis=-2)
+
+
+def _terms(row: Row, coordinates: tuple[str, ...], speed_rad_s: FloatArray) -> ComplexArray:
+    """A row's terms as combinations of the displacements, shape (*speed.shape, n_terms, n_coordinates)."""
+    terms = np.zeros((*speed_rad_s.shape, len(row.terms), len(coordinates)), dtype=np.complex128)
+    for number, term in enumerate(row.terms):
         for motion in term.motions:
-            found[vectors.coordinates.index(motion.coordinate)] += motion.factor * (1j * speed) ** motion.order
+            at = coordinates.index(motion.coordinate)
+            terms[..., number, at] += motion.factor * (1j * speed_rad_s) ** motion.order
     return terms
 
 

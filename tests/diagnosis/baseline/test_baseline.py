@@ -10,8 +10,8 @@ from benchmarks.finite_elements.observed import windows_of
 from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline, positive
-from models.diagnosis.baseline.rows import parameters_of
-from models.diagnosis.baseline.unbalance import combination
+from models.diagnosis.baseline.rows import ROWS, parameters_of
+from models.diagnosis.baseline.unbalance import combination, rotation_of
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.errors import EstimationError
@@ -127,3 +127,20 @@ def test_an_unbalance_smaller_than_its_errors_is_not_determined() -> None:
     with pytest.raises(EstimationError, match="not determined well enough: it is smaller than its errors"):
         combination(np.eye(2), lost)
     np.testing.assert_allclose(combination(np.eye(2), np.diag([1.0, 4.0])), np.eye(2))
+
+
+@pytest.mark.parametrize("resonance", [0.95, 1.0, 1.04, 2.0])
+def test_errors_of_the_unbalance_are_those_of_the_force_however_near_a_resonance_is(resonance: float) -> None:
+    """A white force of density one on a stiff shaft, whose displacement has a narrow resonance near the speed."""
+    window = of_states(recorded(ROTOR, Excitation(), 1, 3)[0], ("y1", "y2"))
+    own = resonance * window.speed_rad_s
+    left = np.array([1.0, 0.02 / own, own**-2, 0.0, 0.0])  # of y1, its derivative, and that of y2, the second
+    w = 2 * np.pi * window.frequencies_hz
+    moved = 1 / (1 + 0.02j * w / own - (w / own) ** 2)
+    window = replace(window, spectrum=np.abs(moved[:, None, None]) ** 2 * np.ones((2, 2)) + 0j)
+    found = rotation_of(window, ("y1", "y2"), [(ROWS[0], left)])
+    assert found is not None
+    at_speed = np.array([1 + 0.02j * window.speed_rad_s / own, -((window.speed_rad_s / own) ** 2)])
+    force = np.concatenate([at_speed, 1j * at_speed])  # what real and imaginary parts of displacements leave
+    for part in (force.real, force.imag):
+        np.testing.assert_allclose(part @ found.covariance @ part, 2 / window.duration_s)
