@@ -148,7 +148,9 @@ def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> flo
 
     def beyond(kept: FloatArray) -> float:
         difference = float(kept.mean()) - reference.mean
-        by_chance = n_errors * reference.scatter * np.sqrt(1 / len(kept) + 1 / reference.hops)
+        # What falls and scatters more is no clipping: the random part has grown, or its resonances are narrower.
+        scatter = reference.scatter if difference > 0 else max(reference.scatter, float(kept.std()))
+        by_chance = n_errors * scatter * np.sqrt(1 / len(kept) + 1 / reference.hops)
         limit = max(by_chance, BEYOND_RANGE * reference.range * np.sqrt(len(hops) / len(kept)))
         return difference if abs(difference) > limit else 0.0
 

@@ -176,6 +176,14 @@ def test_a_lower_threshold_detects_a_smaller_departure() -> None:
     assert departure(by_five_errors, healthy, 4.0) == pytest.approx(-0.144, abs=1e-3)
 
 
+@pytest.mark.parametrize(("scatter", "is_clipped"), [(0.009, False), (0.003, True)])
+def test_a_kurtosis_that_falls_and_scatters_more_is_no_clipping(scatter: float, *, is_clipped: bool) -> None:
+    """As of a random part that grew beside its 1x, because the bearing had lost 40 % of its damping."""
+    healthy = HopReference(mean=3.0, scatter=0.003, hops=78, range=0.001)
+    hops = 2.994 + scatter * np.resize([-1.0, 1.0], HOPS)
+    assert (departure(hops, healthy, 4.0) < 0) == is_clipped
+
+
 @pytest.mark.parametrize("phase", [True, False])
 def test_louder_vibration_is_no_2x_and_a_2x_within_it_is_found(*, phase: bool) -> None:
     def louder(samples: FloatArray) -> FloatArray:
