@@ -12,7 +12,6 @@ the square of the step.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from benchmarks.finite_elements.assembly import (
     ComplexArray,
@@ -39,6 +38,7 @@ PROBES = (
 _DECAYS = 6.0
 _LONGEST_WARM_S = 30.0
 _PIECE = 20_000
+_STRETCH, _SIDE_BY_SIDE = 125, 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,8 @@ def move(
         for order, pull in turning:
             q = harmonic_response(equations, order * speed_rad_s, pull)[list(probed(rotor))]
             W = 1j * order * speed_rad_s
-            values += np.real(np.exp(1j * order * angle)[:, None] * np.concatenate([q, W * q, W**2 * q]))
+            wave = np.concatenate([q, W * q, W**2 * q])
+            values += np.column_stack([np.cos(order * angle), np.sin(order * angle)]) @ [wave.real, -wave.imag]
     else:
         fine_angle = np.asarray(start + speed_rad_s * np.arange(count * fine) / (rate_hz * fine), dtype=np.float64)
         pull = unbalance_force(rotor, speed_rad_s)
@@ -122,28 +123,38 @@ def _steps(roots: ComplexArray, step_s: float) -> tuple[ComplexArray, ComplexArr
 
 
 def _linear(modal: _Modal, rows: tuple[int, ...], force: FloatArray, rate_hz: float) -> FloatArray:
-    decay, before, after = _steps(modal.roots, 1 / rate_hz)
+    """Motion at some coordinates; the samples are cut into stretches that advance side by side, from rest."""
     n = len(modal.roots) // 2
     # one of each pair of complex conjugate roots is enough
     kept = np.flatnonzero(modal.roots.imag >= 0)
+    decay, before, after = (each[kept, None] for each in _steps(modal.roots, 1 / rate_hz))
     output = modal.shapes[list(rows)][:, kept]
     rate = modal.shapes[[n + row for row in rows]][:, kept]
     shapes = np.concatenate([output, rate, rate * modal.roots[kept]]) * np.where(modal.roots[kept].imag == 0, 1, 2)
     drive = modal.drive[kept, : force.shape[1]]
+    drive = np.hstack([before * drive, after * drive])  # of the force a sample before, and now
     direct = modal.direct[list(rows), : force.shape[1]]
-    carried = np.zeros((len(kept), 1), dtype=np.complex128)
-    values = np.empty((len(force), 3 * len(rows)))
-    for begin in range(0, len(force), _PIECE):
-        piece = force[begin : begin + _PIECE]
-        states = drive @ piece.T
-        for number, mode in enumerate(kept):
-            states[number], carried[number] = lfilter(
-                [after[mode], before[mode]], [1, -decay[mode]], states[number], zi=carried[number]
-            )
-        out = values[begin : begin + _PIECE]
-        out[:] = (shapes.real @ states.real - shapes.imag @ states.imag).T
-        out[:, 2 * len(rows) :] += piece @ direct.T
-    return values
+    stretches = -(-len(force) // _STRETCH)
+    padded = np.zeros((stretches * _STRETCH + 1, force.shape[1]))
+    padded[1 : len(force) + 1] = force
+    powers = decay.T ** np.arange(1, _STRETCH + 1)[:, None]
+    starts = np.zeros((len(kept), _SIDE_BY_SIDE + 1), dtype=np.complex128)
+    values = np.empty((stretches, _STRETCH, 3 * len(rows)))
+    for first in range(0, stretches, _SIDE_BY_SIDE):
+        out = values[first : first + _SIDE_BY_SIDE]
+        piece = padded[first * _STRETCH : (first + len(out)) * _STRETCH + 1]
+        inputs = np.hstack([piece[:-1], piece[1:]]).reshape(*out.shape[:2], -1).transpose(1, 2, 0)
+        states = drive @ np.ascontiguousarray(inputs)
+        for number in range(1, _STRETCH):
+            states[number] += decay * states[number - 1]
+        for number in range(len(out)):
+            starts[:, number + 1] = powers[-1] * starts[:, number] + states[-1, :, number]
+        states += powers[:, :, None] * starts[:, : len(out)]
+        starts[:, 0] = starts[:, len(out)]
+        out[:] = (shapes.real @ states.real - shapes.imag @ states.imag).transpose(2, 0, 1)
+    found = values.reshape(-1, 3 * len(rows))[: len(force)]
+    found[:, 2 * len(rows) :] += force @ direct.T
+    return found
 
 
 def _springs(rotor: BeamRotor) -> tuple[tuple[int, float], ...]:
