@@ -93,8 +93,10 @@ def of_displacements(order: Sequence[str], sign: str = "") -> Commissioning:
 
 
 def no_such_rotor() -> Commissioning:
-    masses = {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.3 * LAB.rotor.m2_kg}
-    wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=masses)})
+    """With the damping known, few first guesses differ."""
+    given = {name: getattr(LAB.rotor, name) for name in ("c_by_N_s_per_m", "c_bz_N_s_per_m")}
+    given |= {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.3 * LAB.rotor.m2_kg}
+    wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=given)})
     machine, blocks = with_sensors(wrong, stream(45.0, 43), lambda sensor: sensor.direction != "z")
     return made_of(blocks, machine)
 
