@@ -1,6 +1,7 @@
 """Samples of a simulated machine, windows of a stream of blocks, as a monitor makes them, and their theory."""
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -15,11 +16,17 @@ from simulator.stream import blocks
 from tests.sure import sure
 
 
-def healthy_samples(machine: Machine, duration_s: float, seed: int, *events: Event) -> FloatArray:
-    """Samples of the machine in the shipped healthy scenario with these events."""
+def healthy_blocks(
+    machine: Machine, duration_s: float, seed: int, *events: Event, **how: Any
+) -> tuple[SampleBlock, ...]:
+    """Blocks of the machine in the shipped healthy scenario with these events; `how` is for `blocks`."""
     scenario, _ = load_scenario("healthy")
     scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
-    return np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
+    return tuple(block for block, _ in blocks(scenario, machine, **how))
+
+
+def healthy_samples(machine: Machine, duration_s: float, seed: int, *events: Event) -> FloatArray:
+    return np.concatenate([one.samples for one in healthy_blocks(machine, duration_s, seed, *events, block_s=1.0)])
 
 
 def correlation(A: FloatArray, covariance: FloatArray, lag_s: float) -> FloatArray:

@@ -13,8 +13,8 @@ from models.diagnosis.window.statistics import WindowStatistics, window_statisti
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Sensor
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
+from tests.windows import healthy_blocks
 
 LAB = load_machine("lab")
 _PHYSICS = ("rotor", "operation", "condition")
@@ -55,10 +55,7 @@ def mounted(machine: Machine, at: dict[str, tuple[float, float]]) -> Machine:
 
 @cache
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
-    """Blocks of the shipped healthy scenario with these events."""
-    scenario, machine = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
-    return tuple(block for block, _ in blocks(scenario, machine))
+    return healthy_blocks(LAB, duration_s, seed, *events)
 
 
 def samples_of(stream_: Sequence[SampleBlock]) -> FloatArray:

@@ -56,6 +56,7 @@ from tests.commissioning.rotor_kit import (
 )
 from tests.service.rig.watching import at_once, feed
 from tests.sure import sure
+from tests.windows import healthy_blocks
 
 HEALTHY_S = 90.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
@@ -149,9 +150,7 @@ def test_steady_lines_do_not_prevent_identification_of_the_rotor() -> None:
 def test_a_damped_rotor_is_identified_with_sensors_at_its_bearing_alone() -> None:
     """Without a relation of bearing and disc, the first guess of damping is an assumption, here far too low."""
     damped = LAB.rotor.model_copy(update={"c_by_N_s_per_m": 160.0, "c_bz_N_s_per_m": 160.0})
-    scenario, machine = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=70.0, seed=2_901_092, faults=())
-    shaken = tuple(block for block, _ in blocks(scenario, machine.model_copy(update={"rotor": damped})))
+    shaken = healthy_blocks(LAB.model_copy(update={"rotor": damped}), 70.0, 2_901_092)
     file, at_bearing = with_sensors(PARTIAL, shaken, lambda sensor: sensor.location != "disc")
     made = commissioned(file, recording(file, at_bearing))
     assert made.report.verdict == "limited"  # by its length alone

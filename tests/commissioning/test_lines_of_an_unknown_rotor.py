@@ -13,9 +13,8 @@ from models.commissioning.levels import pieces_of
 from models.diagnosis.window.statistics import WindowStatistics, window_statistics
 from models.signals.block import SampleBlock
 from service.monitor.evaluators import BaselineEvaluator
-from simulator.scenario import load_scenario
-from simulator.stream import blocks
 from tests.commissioning.rotor_kit import (
+    LAB,
     NOTHING,
     PARTIAL,
     commissioned,
@@ -26,6 +25,7 @@ from tests.commissioning.rotor_kit import (
     with_sensors,
 )
 from tests.sure import sure
+from tests.windows import healthy_blocks
 
 HUM = {50.02: 0.03, 100.04: 0.02, 150.06: 0.02}
 
@@ -89,10 +89,9 @@ def test_identification_starts_from_a_guess_without_the_lines() -> None:
     known = {"m1_kg": 2.5, "m2_kg": 4.0, "I2_kg_m2": 9e-3, "I2p_kg_m2": 0.0162, "shaft_length_m": 0.22}
     known |= {"shaft_diameter_m": 0.018}
     own = {"k_by_N_per_m": 4.5e5, "k_bz_N_per_m": 6e5, "c_by_N_s_per_m": 180.0, "c_bz_N_s_per_m": 200.0}
-    scenario, kit = load_scenario("healthy")
-    rotor = kit.model_copy(update={"rotor": kit.rotor.model_copy(update=known | own)})
+    rotor = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update=known | own)})
     told = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=known)})
-    shown = [block for block, _ in blocks(scenario.overridden(duration_s=130.0, seed=5_270_042), rotor)]
+    shown = healthy_blocks(rotor, 130.0, 5_270_042)
     machine, seen = with_sensors(told, with_lines(shown, {50.02: 0.1, 100.04: 0.06, 150.06: 0.1}), no_velocity)
     windows = [piece.window for piece in pieces_of([recording(machine, seen)])]
     assert identify(

@@ -6,9 +6,9 @@ from models.commissioning.commissioned import Installed
 from models.machine import Machine, load_machine
 from models.physics.rotor import PARAMETERS
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests.service.rig.watching import feed
+from tests.windows import healthy_blocks
 
 SEED = 3
 
@@ -31,10 +31,7 @@ def damped() -> Machine:
 def test_a_name_has_low_confidence_only_if_a_heavier_disc_explains_the_data_as_well(
     event: Event, *, told: bool
 ) -> None:
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=170.0, seed=SEED, faults=(event,))
-    stream = (block for block, _ in blocks(scenario, damped(), 1.0))
-    _, events = feed(MachineMonitor(Installed(damped())), stream)
+    _, events = feed(MachineMonitor(Installed(damped())), healthy_blocks(damped(), 170.0, SEED, event, block_s=1.0))
     raised = {one.alarm.name: one for one in events if one.kind == "raised" and one.alarm.name in PARAMETERS}
     assert raised
     assert told or set(raised) == {event.parameter}

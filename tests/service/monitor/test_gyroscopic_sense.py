@@ -13,19 +13,17 @@ from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.monitor.evaluators import evaluator_for
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, PARTIAL, blind, commissioned, recording, windows_of, without_angle
 from tests.service.rig.watching import at_once, feed, resumed
+from tests.windows import healthy_blocks
 
 SEED = 4_900_001
 
 
 @cache
 def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
-    return tuple(block for block, _ in blocks(scenario, in_sense(LAB, "opposite")))
+    return healthy_blocks(in_sense(LAB, "opposite"), duration_s, seed, *events)
 
 
 def test_forward_whirl_rises_with_speed_only_in_the_opposite_sense() -> None:

@@ -12,9 +12,9 @@ from models.machine import Machine, load_machine, load_machine_file
 from models.signals.block import SampleBlock
 from rotorwatch.records.windows import Parameter
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests.service.rig.watching import at_once, feed, named, resumed
+from tests.windows import healthy_blocks
 
 LAB = load_machine("lab")
 SEED = 4_910_001
@@ -27,9 +27,7 @@ def with_heavy_spot(phase_rad: float) -> Machine:
 
 @cache
 def stream(duration_s: float, phase_rad: float, *events: Event) -> tuple[SampleBlock, ...]:
-    scenario, _ = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=duration_s, seed=SEED, faults=events)
-    return tuple(block for block, _ in blocks(scenario, with_heavy_spot(phase_rad)))
+    return healthy_blocks(with_heavy_spot(phase_rad), duration_s, SEED, *events)
 
 
 def e_of(parameters: tuple[Parameter, ...]) -> float:

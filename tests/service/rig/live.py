@@ -30,10 +30,10 @@ from service.stream.inbox import RawBlock
 from service.stream.transport import Link, MachineCallbacks, MachineLink
 from service.stream.worker import MachineWorker
 from simulator.publisher import PublishSettings, publish
-from simulator.scenario import Event, load_scenario
-from simulator.stream import blocks
+from simulator.scenario import Event
 from tests import loopback
 from tests.service.rig.preloaded import Preloaded
+from tests.windows import healthy_blocks
 
 endpoint = loopback.endpoint
 ROOT = Path(__file__).parents[3]
@@ -151,9 +151,7 @@ def scenario_blocks(duration_s: float, *faults: Event, start_ns: int = START_NS,
     """Blocks of 0.1 s of the shipped healthy scenario, shortened, with faults added; read-only."""
     count, what = round(10 * duration_s), (faults, start_ns, run)
     if len(_simulated.get(what, ())) < count:
-        scenario, machine = load_scenario("healthy")
-        scenario = scenario.overridden(duration_s=duration_s, seed=7_700_011, faults=faults)
-        _simulated[what] = [block for block, _ in blocks(scenario, machine, start_ns=start_ns, run=run)]
+        _simulated[what] = [*healthy_blocks(LAB, duration_s, 7_700_011, *faults, start_ns=start_ns, run=run)]
         for block in _simulated[what]:
             block.samples.setflags(write=False)
     return _simulated[what][:count]

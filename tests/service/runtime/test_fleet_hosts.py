@@ -21,11 +21,12 @@ from models.machine import load_machine
 from rotorwatch.records.health import Health, HealthState
 from service.monitor.monitor import MachineMonitor
 from service.runtime.fleet import HEALTH_CHECKS
-from simulator.scenario import load_scenario, parse_fault
-from simulator.stream import blocks
+from simulator.scenario import parse_fault
 from tests.service.rig.hosts import MIDDLE, Hosts, hosts, why_not
 from tests.service.rig.live import PATIENT, ROOT, SHORT, machine_file, program, until
 from tests.service.rig.postgres import USER, postgres_server
+from tests.service.rig.watching import feed
+from tests.windows import healthy_blocks
 
 _WHY_NOT = why_not()
 # Hosts are network namespaces, which only root can create.
@@ -116,11 +117,7 @@ def settings_of(folder: Path, net: Hosts, database: str) -> Path:
 def undisturbed(file: Path, seed: int, length_s: float) -> list[tuple[int, str, str, int]]:
     """Alarm log of a machine that is watched by one monitor from beginning to end."""
     machine = load_machine(file)
-    scenario, _ = load_scenario("healthy")
-    given = scenario.overridden(seed=seed, duration_s=length_s, faults=(parse_fault(FAULT),))
-    monitor = MachineMonitor(Installed(machine))
-    stream = (monitor.step(block) for block, _ in blocks(given, machine, 0.1, START_NS))
-    events = [event for report in stream for event in report.events]
+    _, events = feed(MachineMonitor(Installed(machine)), healthy_blocks(machine, length_s, seed, parse_fault(FAULT)))
     return [(one.sequence, one.kind.value, one.alarm.name, one.time_ns) for one in events]
 
 

@@ -21,10 +21,10 @@ from rotorwatch.records.alarms import Alarm
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.stream.checkpoints import stored_event, stored_report
-from simulator.scenario import load_scenario, parse_fault
-from simulator.stream import blocks
+from simulator.scenario import parse_fault
 from tests.loopback import session_of
 from tests.service.rig.live import (
+    LAB,
     QUICK,
     START_NS,
     Program,
@@ -36,6 +36,7 @@ from tests.service.rig.live import (
     until_subscribed,
 )
 from tests.service.rig.postgres import opened
+from tests.windows import healthy_blocks
 
 BLOCK_S = 0.5
 FIRST, ALL = 78, 124
@@ -44,10 +45,8 @@ FIRST, ALL = 78, 124
 
 @cache
 def stream() -> tuple[SampleBlock, ...]:
-    scenario, machine = load_scenario("healthy")
     faults = (parse_fault("c_bz=0.5@0"), parse_fault("k_by=-0.33@30"))
-    story = scenario.overridden(duration_s=ALL * BLOCK_S, seed=7_700_031, faults=faults)
-    return tuple(block for block, _ in blocks(story, machine, BLOCK_S, START_NS))
+    return healthy_blocks(LAB, ALL * BLOCK_S, 7_700_031, *faults, block_s=BLOCK_S)
 
 
 class Plant:
