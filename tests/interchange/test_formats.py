@@ -337,23 +337,21 @@ def test_a_file_that_is_not_of_its_format_is_named(tmp_path: Path, suffix: str) 
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
-def test_a_truncated_measurement_is_named_without_library_warnings(tmp_path: Path) -> None:
-    t, x, v, a = signals(1000)
-    path = tmp_path / "run.mf4"
-    write_mf4(path, {"t": t, "x": x, "v": v, "a": a})
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(SourceError, match=r"run\.mf4: damaged, or no MF4 file: .*"):
-        imported(tmp_path, path, CHANNELS)
+@pytest.mark.parametrize(
+    ("name", "write", "told"),
+    [
+        ("run.mf4", write_mf4, r"run\.mf4: damaged, or no MF4 file: .*"),
+        ("run.tdms", write_tdms, r"has \d+ rows, .*; the file ends within a segment: it is truncated"),
+    ],
+)
+def test_a_truncated_file_is_named_without_library_warnings(
+    tmp_path: Path, name: str, write: Callable[[Path, Columns], None], told: str
+) -> None:
+    write(tmp_path / name, dict(zip("txva", signals(1000), strict=True)))
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-2000])
+    with pytest.raises(SourceError, match=told):
+        imported(tmp_path, tmp_path / name, CHANNELS)
     gc.collect()  # unclosed files would warn now
-
-
-def test_a_truncated_tdms_file_is_named(tmp_path: Path) -> None:
-    t, x, v, a = signals(1000)
-    path = tmp_path / "run.tdms"
-    write_tdms(path, {"t": t, "x": x, "v": v, "a": a})
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(SourceError, match=r"has \d+ rows, .*; the file ends within a segment: it is truncated"):
-        imported(tmp_path, path, CHANNELS)
 
 
 def test_the_error_for_an_unknown_format_lists_the_known_ones(tmp_path: Path) -> None:

@@ -125,22 +125,21 @@ def test_the_drawing_rotates_the_unbalance_and_marks_a_faulty_sensor(browser: Br
         expect(drawing.locator("g.part", has_text="c_by")).to_contain_text("too little data yet")
 
 
-@pytest.mark.parametrize(("part", "least", "most"), [(1.0, 20.0, 22.0), (1e-4, 0.0, 0.5)])
-def test_a_tiles_trend_breaks_at_gaps_and_is_flat_below_detectable_changes(
-    browser: Browser, runtime: Runtime, part: float, least: float, most: float
-) -> None:
-    trend = {"site": "demo", "machine": "lab", "quantity": "parameter", "name": "k_by", "length_ns": 10**9}
-    starts = [at * 10**9 for at in (0, 1, 2, 4, 30, 60, 61)]  # 4: one bucket without a reading is no gap
-    told = trend | {"starts_ns": starts, "means": [part * mean for mean in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]}
+def test_a_tiles_trend_breaks_at_gaps_and_is_flat_below_detectable_changes(browser: Browser, runtime: Runtime) -> None:
+    told = {"site": "demo", "machine": "lab", "quantity": "parameter", "name": "k_by", "length_ns": 10**9}
+    told |= {"starts_ns": [at * 10**9 for at in (0, 1, 2, 4, 30, 60, 61)]}  # 4: one without a reading is no gap
     with looking(browser, runtime.http_url) as page:
         page.route("**/api/v1/trends?*", lambda route: route.fulfill(json={"trends": [told]}))
         page.goto(f"{runtime.http_url}/#/")
-        lines = page.locator("spark-line polyline")
-        expect(lines).to_have_count(3)
-        points = [(line.get_attribute("points") or "").split() for line in lines.all()]
-        assert [len(one) for one in points] == [4, 2, 2]  # the single one is a dot
-        rise = float(points[0][0].partition(",")[2]) - float(points[2][1].partition(",")[2])
-        assert least <= rise <= most  # of 22, the full height for detectable changes
+        for part, least, most in ((1.0, 20.0, 22.0), (1e-4, 0.0, 0.5)):
+            told["means"] = [part * mean for mean in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]
+            page.reload()
+            lines = page.locator("spark-line polyline")
+            expect(lines).to_have_count(3)
+            points = [(line.get_attribute("points") or "").split() for line in lines.all()]
+            assert [len(one) for one in points] == [4, 2, 2]  # the single one is a dot
+            rise = float(points[0][0].partition(",")[2]) - float(points[2][1].partition(",")[2])
+            assert least <= rise <= most  # of 22, the full height for detectable changes
 
 
 @pytest.mark.long
