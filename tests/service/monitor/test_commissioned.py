@@ -94,10 +94,9 @@ def test_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter() -> N
     assert not any(window.parameters for window in full(windows))
 
 
-def with_gain(factor: float, healthy: Sequence[SampleBlock]) -> Sequence[SampleBlock]:
-    """Blocks in which the velocity of the disc, horizontal, is multiplied by a factor."""
-    scale = np.where([sensor.name == "y2_dot" for sensor in MACHINE.sensors], factor, 1.0)
-    return with_samples(healthy, samples_of(healthy) * scale)
+def factored(healthy: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
+    """Blocks in which channels are multiplied by factors."""
+    return with_samples(healthy, samples_of(healthy) * [factors.get(sensor.name, 1.0) for sensor in MACHINE.sensors])
 
 
 @pytest.mark.parametrize("change", [0.0, -0.35])
@@ -105,7 +104,7 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
     """Which of the two sensors has drifted is not known: the reading of k_by is wrong by all of it or hardly at all."""
     event = Event(at_s=0.0, parameter="k_by", relative_change=change)
     ran = stream(65.0, SEED + 2, *([event] if change else []))
-    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, with_gain(1.03, ran)))
+    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, factored(ran, y2_dot=1.03)))
     raised = {event.alarm.name for event in drifted[1] if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"data-gain"} | ({"k_by"} if change else set())
     last = full(drifted[0])[-1]
@@ -117,11 +116,6 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
     for name in ("k_by", "c_by", "e"):
         assert now[name] > 0.9 * np.hypot(before[name], 0.02 * (1 + change * (name == "k_by")))
     assert now["k_bz"] < 1.1 * before["k_bz"]
-
-
-def factored(healthy: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
-    """Blocks in which channels are multiplied by factors."""
-    return with_samples(healthy, samples_of(healthy) * [factors.get(sensor.name, 1.0) for sensor in MACHINE.sensors])
 
 
 def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
@@ -169,7 +163,7 @@ def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
 
 
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
-    windows, events = feed(MachineMonitor(installed()), with_gain(1.08, stream(65.0, SEED + 1)))
+    windows, events = feed(MachineMonitor(installed()), factored(stream(65.0, SEED + 1), y2_dot=1.08))
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
     assert not any(window.parameters for window in full(windows))
 
@@ -177,8 +171,7 @@ def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
 def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
     """The relation that was learned with the dead sensor is not read; the other still holds."""
     ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
-    dead = np.where([sensor.name == "y1" for sensor in MACHINE.sensors], np.nan, 1.0)
-    windows, events = feed(MachineMonitor(installed()), with_samples(ran, samples_of(ran) * dead))
+    windows, events = feed(MachineMonitor(installed()), factored(ran, y1=np.nan))
     raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"data-missing", "k_bz"}
     last = full(windows)[-1]
@@ -274,11 +267,7 @@ def test_level_growth_that_a_named_change_does_not_explain_raises_its_alarm() ->
 
 
 def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named() -> None:
-    names = [channel.name for channel in LAB.sensors]
-    healthy = stream(63.0, SEED + 8)
-    samples = samples_of(healthy)
-    samples[:, [names.index("y2"), names.index("y2_dot")]] *= 0.8
-    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    windows, events = feed(MachineMonitor(installed()), factored(stream(63.0, SEED + 8), y2=0.8, y2_dot=0.8))
     raised = {event.alarm.name: event.alarm for event in events}
     assert "gain of y2 and y2_dot: 0.8" in raised[MODEL].note
     assert "gain of y2 and y2_dot: 0.8" in full(windows)[-1].suspect
