@@ -72,6 +72,11 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
     return found
 
 
+def factored(machine: MachineFile, stream_: Sequence[SampleBlock], **factors: float) -> list[SampleBlock]:
+    """The machine's blocks with channels multiplied by factors."""
+    return with_samples(stream_, samples_of(stream_) * [factors.get(sensor.name, 1.0) for sensor in machine.sensors])
+
+
 def with_sensors(
     machine: MachineFile, stream_: Sequence[SampleBlock], kept: Callable[[Sensor], bool]
 ) -> tuple[MachineFile, list[SampleBlock]]:

@@ -34,6 +34,7 @@ from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT, RIG
 from tests.service.rig.live import START_NS, scenario_blocks
 from tests.service.rig.replaying import recorded, recording
+from tests.service.rig.watching import held
 from tests.sure import sure
 
 NAMES = [one.name for one in KIT.sensors]
@@ -44,12 +45,7 @@ SECONDS = 30.0
 def dead(
     *names: str, between_s: tuple[float, float] = (0.0, SECONDS), value: float = np.nan
 ) -> tuple[SampleBlock, ...]:
-    lacking = np.isin(NAMES, names)
-    from_ns, to_ns = (START_NS + round(one * 1e9) for one in between_s)
-    return tuple(
-        replace(one, samples=np.where(lacking & (from_ns <= one.start_ns < to_ns), value, one.samples))
-        for one in scenario_blocks(SECONDS)
-    )
+    return tuple(held(scenario_blocks(SECONDS), [NAMES.index(name) for name in names], value, *between_s))
 
 
 def shown(way: str, folder: Path, *names: str, value: float = np.nan) -> tuple[LatestData, Sampled]:

@@ -23,6 +23,7 @@ from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     commissioned,
+    factored,
     mounted,
     recording,
     samples_of,
@@ -94,17 +95,12 @@ def test_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter() -> N
     assert not any(window.parameters for window in full(windows))
 
 
-def factored(healthy: Sequence[SampleBlock], **factors: float) -> Sequence[SampleBlock]:
-    """Blocks in which channels are multiplied by factors."""
-    return with_samples(healthy, samples_of(healthy) * [factors.get(sensor.name, 1.0) for sensor in MACHINE.sensors])
-
-
 @pytest.mark.parametrize("change", [0.0, -0.35])
 def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(change: float) -> None:
     """Which of the two sensors has drifted is not known: the reading of k_by is wrong by all of it or hardly at all."""
     event = Event(at_s=0.0, parameter="k_by", relative_change=change)
     ran = stream(65.0, SEED + 2, *([event] if change else []))
-    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, factored(ran, y2_dot=1.03)))
+    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, factored(MACHINE, ran, y2_dot=1.03)))
     raised = {event.alarm.name for event in drifted[1] if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"data-gain"} | ({"k_by"} if change else set())
     last = full(drifted[0])[-1]
@@ -123,7 +119,7 @@ def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
     ran = stream(65.0, SEED + 2)
     plain, drifted = (
         {one.name: one for one in full(feed(MachineMonitor(installed()), seen)[0])[-1].parameters}
-        for seen in (ran, factored(ran, y1=0.95))
+        for seen in (ran, factored(MACHINE, ran, y1=0.95))
     )
     wrong = sure(drifted["k_by"].relative_change) - sure(plain["k_by"].relative_change)
     assert 0.08 < wrong < 1.5 * sure(drifted["k_by"].standard_error)
@@ -143,7 +139,7 @@ def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
             own, other = names.index(first), names.index(first.replace("y", "z"))
             y, z = samples[:, own].copy(), samples[:, other].copy()
             samples[:, own], samples[:, other] = (y + z) / np.sqrt(2), (z - y) / np.sqrt(2)
-        return factored(with_samples(seen, samples), **factors)
+        return factored(MACHINE, with_samples(seen, samples), **factors)
 
     made = Installed(machine, None, commissioned(machine, recording(machine, turned(before()[:1500]))).commissioned)
     ran = stream(65.0, SEED + 2)
@@ -156,14 +152,14 @@ def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
 
 
 def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
-    windows, _ = feed(MachineMonitor(installed()), factored(stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
+    windows, _ = feed(MachineMonitor(installed()), factored(MACHINE, stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
     dead, drifted = full(windows)[-1].sensors
     assert dead.text.endswith("the machine is diagnosed without it")
     assert drifted.text.endswith("the machine is diagnosed with larger errors")
 
 
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
-    windows, events = feed(MachineMonitor(installed()), factored(stream(65.0, SEED + 1), y2_dot=1.08))
+    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, stream(65.0, SEED + 1), y2_dot=1.08))
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
     assert not any(window.parameters for window in full(windows))
 
@@ -171,7 +167,7 @@ def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
 def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
     """The relation that was learned with the dead sensor is not read; the other still holds."""
     ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
-    windows, events = feed(MachineMonitor(installed()), factored(ran, y1=np.nan))
+    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, ran, y1=np.nan))
     raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
     assert raised == {"data-missing", "k_bz"}
     last = full(windows)[-1]
@@ -187,7 +183,7 @@ def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
 def test_a_plane_is_diagnosed_without_any_sensor_of_the_other() -> None:
     ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
     dead = dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), np.nan)
-    windows, events = feed(MachineMonitor(installed()), factored(ran, **dead))
+    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, ran, **dead))
     assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-missing", "k_bz"}
     read = {one.name for one in full(windows)[-1].parameters if one.relative_change is not None}
     assert read == {"k_bz", "c_bz", "e"}
@@ -267,7 +263,7 @@ def test_level_growth_that_a_named_change_does_not_explain_raises_its_alarm() ->
 
 
 def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named() -> None:
-    windows, events = feed(MachineMonitor(installed()), factored(stream(63.0, SEED + 8), y2=0.8, y2_dot=0.8))
+    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, stream(63.0, SEED + 8), y2=0.8, y2_dot=0.8))
     raised = {event.alarm.name: event.alarm for event in events}
     assert "gain of y2 and y2_dot: 0.8" in raised[MODEL].note
     assert "gain of y2 and y2_dot: 0.8" in full(windows)[-1].suspect

@@ -1,6 +1,5 @@
 """A machine with known parameters is diagnosed without its dead sensors."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -9,15 +8,14 @@ import pytest
 
 from models.commissioning.commissioned import Installed, install
 from models.diagnosis.window.moments import plan_for
-from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, parse_fault
-from tests.commissioning.rotor_kit import commissioned, recording, with_sensors
+from tests.commissioning.rotor_kit import commissioned, factored, recording, with_sensors
 from tests.service.rig.live import LAB, scenario_blocks
-from tests.service.rig.watching import feed, raised, resumed
+from tests.service.rig.watching import feed, held, raised, resumed
 from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})})
@@ -26,20 +24,15 @@ DEAD_S, CHANGE_S, END_S = 35.0, 50.0, 90.0
 
 def dying(
     columns: list[int], value: float, *changes: Event, dead_s: float = DEAD_S, end_s: float = END_S
-) -> Iterator[SampleBlock]:
-    stream = scenario_blocks(end_s, *changes)
-    for block in stream:
-        samples = block.samples.copy()
-        if block.start_ns - stream[0].start_ns >= dead_s * 1e9:
-            samples[:, columns] = value
-        yield replace(block, samples=samples)
+) -> list[SampleBlock]:
+    return held(scenario_blocks(end_s, *changes), columns, value, dead_s)
 
 
 @pytest.mark.parametrize(("columns", "value"), [([0], 12e-6), pytest.param([2, 5], np.nan, marks=pytest.mark.long)])
 def test_a_change_is_named_without_the_dead_sensors(columns: list[int], value: float) -> None:
     installed = install(KIT, None)
     monitor = MachineMonitor(installed, remembered=True)
-    stream = list(dying(columns, value, parse_fault(f"k_by=-0.2@{CHANGE_S}")))
+    stream = dying(columns, value, parse_fault(f"k_by=-0.2@{CHANGE_S}"))
     reports, _ = feed(monitor, stream[:495])
     dead = [one for one in reports if one.filled == 1 and one.sensors]
     assert len(dead) == 3
@@ -103,11 +96,6 @@ def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
     assert [one.name for one in reports[-1].parameters if one.relative_change is not None] == list(PARAMETERS)
 
 
-def drifted(stream: Sequence[SampleBlock], machine: MachineFile, **gains: float) -> list[SampleBlock]:
-    factors = np.array([gains.get(sensor.name, 1.0) for sensor in machine.sensors], dtype=np.float32)
-    return [replace(block, samples=block.samples * factors) for block in stream]
-
-
 @pytest.mark.parametrize(
     "gains",
     [
@@ -118,7 +106,7 @@ def drifted(stream: Sequence[SampleBlock], machine: MachineFile, **gains: float)
 def test_a_change_is_named_although_a_gain_has_drifted(gains: dict[str, float]) -> None:
     """Without the one of two sensors that has drifted, the theory explains the window."""
     monitor = MachineMonitor(identified(), remembered=True)
-    stream = drifted(scenario_blocks(110.0, parse_fault("k_by=-0.2@70"))[300:], KIT, **gains)
+    stream = factored(KIT, scenario_blocks(110.0, parse_fault("k_by=-0.2@70"))[300:], **gains)
     reports, _ = feed(monitor, stream[:395])
     full = [one for one in reports if one.filled == 1]
     assert len(full) == 2
@@ -139,7 +127,7 @@ def test_errors_are_larger_where_the_theory_does_not_tell_which_gain_has_drifted
     installed = Installed(machine, None, commissioned(machine, recording(machine, healthy)).commissioned)
     read = []
     for gain in (1.0, 1.05):
-        reports, _ = feed(monitor := MachineMonitor(installed), drifted(healthy[:450], machine, y1=gain))
+        reports, _ = feed(monitor := MachineMonitor(installed), factored(machine, healthy[:450], y1=gain))
         assert raised(monitor) == ({"data-gain"} if gain > 1 else set())
         read.append(next(one for one in reports[-2].parameters if one.name == "e"))
     (before, plain), (now, wide) = ((sure(one.relative_change), sure(one.standard_error)) for one in read)

@@ -1,6 +1,6 @@
 """Machines with nothing known but their sensors: levels are watched from the first hop on."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from service.stream.checkpoints import checkpoint_step, restored
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import NOTHING, commissioned, elsewhere, healthy, stream
 from tests.service.rig.live import LAB, scenario_blocks
-from tests.service.rig.watching import resumed
+from tests.service.rig.watching import held, resumed
 from tests.sure import sure
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
@@ -59,7 +59,7 @@ def blocks(
         yield SampleBlock(START_NS + round(number * BLOCK_S * 1e9), number, 1, RATE_HZ, samples)
 
 
-def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
+def run(monitor: MachineMonitor, stream: Iterable[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
     """Reports as JSON, and alarm events: kind, alarm and time, in seconds from the start of all streams."""
     windows, events = [], []
     for block in stream:
@@ -128,14 +128,14 @@ def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
 
 def test_a_restarted_monitor_continues_bit_for_bit() -> None:
     stream = list(blocks(5, 100, growth=(85.0, 3.0)))
-    expected = run(MachineMonitor(install(FAN, None)), iter(stream))
+    expected = run(MachineMonitor(install(FAN, None)), stream)
     first = MachineMonitor(install(FAN, None))
-    before = run(first, iter(stream[:90]))
+    before = run(first, stream[:90])
     for whole in (True, False):
         second = resumed(first, install(FAN, None), whole=whole)
         for number, block in enumerate(() if whole else stream[:90]):
             second._window.recall(block.samples, block.start_ns, newest=number == 89)
-        after = run(second, iter(stream[90:]))
+        after = run(second, stream[90:])
         assert (before[0] + after[0], before[1] + after[1]) == expected, whole
 
 
@@ -308,14 +308,6 @@ def test_status_shows_the_detectable_growth_and_fits_narrow_terminals(monkeypatc
     assert "│ 7                │       │" in said
 
 
-def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:
-    """The stream with one channel stuck at a value."""
-    for block in stream:
-        samples = block.samples.copy()
-        samples[:, column] = value
-        yield replace(block, samples=samples)
-
-
 def test_a_dead_sensor_anywhere_is_a_sensor_fault() -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, held(blocks(5, 60), 1, 0.25))
@@ -337,10 +329,10 @@ def test_a_faulty_probe_does_not_raise_s_max_of_the_other_probe() -> None:
             samples[:, 1] = -1270 + 0.01 * samples[:, 1]
         jumping.append(replace(block, samples=samples))
     monitor = MachineMonitor(install(pump, None))
-    _, events = run(monitor, iter(jumping[:720]))
+    _, events = run(monitor, jumping[:720])
     assert "data-offset" in {name for _, name, _ in events}
     assert [one.s_max for one in latest(monitor).levels] == [None, None]
-    _, later = run(monitor, iter(jumping[720:]))
+    _, later = run(monitor, jumping[720:])
     assert {name for _, name, _ in events + later} == {"data-offset", "level:DE-Y"}
     assert sure(latest(monitor).levels[0].s_max) < 100
 
@@ -359,7 +351,7 @@ def test_lines_unknown_to_the_theory_are_found_without_commissioning() -> None:
             turned = block.samples[:, [-1]]
             samples[:, fast] += 0.7 * samples[:, fast].std(axis=0) * np.cos(MESH * turned)
         meshing.append(replace(block, samples=samples))
-    _, ((kind, name, _),) = run(monitor, iter(meshing))
+    _, ((kind, name, _),) = run(monitor, meshing)
     assert (kind, name) == (EventKind.RAISED, "model")
     note = next(one for one in monitor.health().alarms if one.name == "model").note
     assert "a line within 3" in note

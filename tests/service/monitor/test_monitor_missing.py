@@ -1,6 +1,6 @@
 """A channel of NaN loses only its own readings, and none of the others."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -22,7 +22,7 @@ from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import commissioned, elsewhere, recording, stream
 from tests.service.rig.live import LAB, scenario_blocks
-from tests.service.rig.watching import feed, named, raised, resumed
+from tests.service.rig.watching import feed, held, named, raised, resumed
 from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0, "max_span_s": 40.0})})
@@ -35,14 +35,9 @@ FROM_S, TO_S, END_S = 31.0, 33.0, 125.0
 
 def without(
     column: int, from_s: float, to_s: float, value: float = np.nan, *, end_s: float = END_S
-) -> Iterator[SampleBlock]:
+) -> list[SampleBlock]:
     """A stream in which one channel is NaN, or another value, for a time."""
-    stream = scenario_blocks(end_s)
-    for block in stream:
-        samples = block.samples.copy()
-        if from_s <= (block.start_ns - stream[0].start_ns) / 1e9 < to_s:
-            samples[:, column] = value
-        yield replace(block, samples=samples)
+    return held(scenario_blocks(end_s), column, value, from_s, to_s)
 
 
 def blamed(stream: Iterable[SampleBlock]) -> set[str]:
@@ -62,7 +57,7 @@ def usual(end_s: float, *, moved: bool = False) -> Sequence[Report]:
 
 def test_a_missing_channel_is_reported_until_its_gap_has_left_the_window() -> None:
     monitor, sound = MachineMonitor(install(SOON, None)), usual(85.0)
-    stream = list(without(Z1_DOT, FROM_S, TO_S, end_s=85.0))
+    stream = without(Z1_DOT, FROM_S, TO_S, end_s=85.0)
     reports, events = feed(monitor, stream)
     assert monitor.health().quality.refused_blocks == {}
     first_ns = stream[0].start_ns
@@ -121,7 +116,7 @@ def test_a_dead_casing_sensor_does_not_change_the_diagnosis(value: float, kind: 
     ("column", "state", "alarm"), [(THETA, "theta", PHASE_REFERENCE), (2, "y1_dot", "data-missing")]
 )
 def test_a_sensor_never_connected_is_reported_before_the_first_full_window(column: int, state: str, alarm: str) -> None:
-    monitor, stream = MachineMonitor(install(KIT, None)), list(without(column, 0.0, END_S, end_s=50.0))
+    monitor, stream = MachineMonitor(install(KIT, None)), without(column, 0.0, END_S, end_s=50.0)
     reports = feed(monitor, stream[:190])[0]
     assert [[fault.states for fault in one.sensors] for one in reports] == [[(state,)]] * len(reports)
     assert {one.state for one in reports} == {HealthState.WARMING}
@@ -137,7 +132,7 @@ def test_a_lost_phase_reference_raises_only_its_own_alarm(lost: float) -> None:
     made = commissioned(KIT, recording(KIT, scenario_blocks(END_S)[:800])).commissioned
     monitor, told = MachineMonitor(Installed(KIT, None, made)), set[str]()
     levels: dict[bool, list[ChannelLevels]] = {True: [], False: []}
-    for block in list(without(THETA, 114.4, END_S + 25, lost, end_s=END_S + 25))[800:]:
+    for block in without(THETA, 114.4, END_S + 25, lost, end_s=END_S + 25)[800:]:
         done = monitor.step(block)
         told |= {event.alarm.name for event in done.events}
         for report in done.windows:
@@ -169,10 +164,8 @@ def test_without_an_angle_levels_are_not_compared_with_another_speed() -> None:
     rig = elsewhere(KIT)
     healthy = [recording(rig, at_speed(rpm, end_s), f"{rpm}.mcap") for rpm, end_s in ((1320.0, 85.0), (2600.0, 45.0))]
     monitor, told = MachineMonitor(Installed(rig, None, commissioned(rig, *healthy).commissioned)), set[str]()
-    for number, block in enumerate(at_speed(2600.0, 75.0)):
-        samples = block.samples.copy()
-        samples[:, THETA] = np.nan if number >= 300 else samples[:, THETA]
-        told |= {event.alarm.name for event in monitor.step(replace(block, samples=samples)).events}
+    for block in held(at_speed(2600.0, 75.0), THETA, np.nan, 30.0):
+        told |= {event.alarm.name for event in monitor.step(block).events}
     assert told == {PHASE_REFERENCE}
 
 
@@ -200,7 +193,7 @@ def test_a_lost_phase_reference_is_not_taken_for_a_slow_machine(lost: float) -> 
 def test_without_an_angle_other_sensors_are_checked_except_where_it_comes_or_goes(
     from_s: float, faults: set[str]
 ) -> None:
-    stream = list(without(THETA, from_s, END_S, end_s=38.0))
+    stream = without(THETA, from_s, END_S, end_s=38.0)
     for block in stream:
         block.samples[:, 1] *= 1.25 if from_s == 0 else 1.0
     assert blamed(stream) == faults
@@ -221,7 +214,7 @@ def test_blocks_with_single_nan_samples_or_only_nan_are_refused(
 
 
 def test_a_restored_monitor_with_a_recalled_window_continues_bit_for_bit() -> None:
-    stream = list(without(Z1_DOT, FROM_S, TO_S, end_s=75.0))
+    stream = without(Z1_DOT, FROM_S, TO_S, end_s=75.0)
     monitor = MachineMonitor(install(KIT, None))
     half = 340  # a second after the last missing sample
     feed(monitor, stream[:half])[0]

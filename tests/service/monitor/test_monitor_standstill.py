@@ -18,7 +18,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
 from tests.commissioning.rotor_kit import commissioned, recording
 from tests.service.rig.live import LAB, scenario_blocks
-from tests.service.rig.watching import feed, named, resumed
+from tests.service.rig.watching import feed, held, named, resumed
 
 STOPS_S, STANDS_S, STARTS_S, RUNS_S, END_S = 40.0, 50.0, 95.0, 105.0, 150.0
 NOISE = 0.01
@@ -110,11 +110,7 @@ def test_signals_lost_while_the_machine_runs_raise_a_data_alarm(what: str, alarm
 @pytest.mark.parametrize("dead", [pytest.param(0, marks=pytest.mark.long), 3])
 def test_a_stop_with_a_dead_channel_adds_no_other_sensor_fault(dead: int) -> None:
     name = KIT.sensors[dead].name
-    silent = [
-        replace(block, samples=np.where(np.arange(len(KIT.sensors)) == dead, np.float32(0), block.samples))
-        for block in stopped()
-    ]
-    for one, other in zip(feed(monitor_of(KIT), silent)[0], usual()[0], strict=True):
+    for one, other in zip(feed(monitor_of(KIT), held(stopped(), dead, 0.0))[0], usual()[0], strict=True):
         found, known = ({fault.states for fault in each.sensors} for each in (one, other))
         assert found - {(name,)} == {states for states in known if name not in states}
 

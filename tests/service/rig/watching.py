@@ -1,6 +1,8 @@
 """A monitor fed without a network, and its output."""
 
+import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from models.commissioning.commissioned import Installed
@@ -19,6 +21,19 @@ def feed(target: MachineMonitor, stream: Iterable[SampleBlock]) -> tuple[list[Re
         windows += report.windows
         events += report.events
     return windows, events
+
+
+def held(
+    stream: Iterable[SampleBlock], columns: int | list[int], value: float, from_s: float = 0.0, to_s: float = math.inf
+) -> list[SampleBlock]:
+    """The stream with channels held at a value, or missing as NaN, for a time in seconds from its beginning."""
+    found: list[SampleBlock] = []
+    for block in stream:
+        samples = block.samples.copy()
+        if from_s <= (block.start_ns - (found or [block])[0].start_ns) / 1e9 < to_s:
+            samples[:, columns] = value
+        found.append(replace(block, samples=samples))
+    return found
 
 
 M = TypeVar("M", bound=MachineFile)
