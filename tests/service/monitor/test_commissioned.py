@@ -1,7 +1,6 @@
 """The monitor of a machine commissioned without known parameters, from block to alarm."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,7 +12,7 @@ from models.levels.settings import LevelSettings
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
-from models.signals.channels import Quantity
+from models.signals.channels import Quantity, Sensor
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
@@ -25,10 +24,12 @@ from tests.commissioning.rotor_kit import (
     commissioned,
     factored,
     mounted,
+    no_velocity,
     recording,
     samples_of,
     stream,
     with_samples,
+    with_sensors,
 )
 from tests.service.rig.watching import at_once, feed
 from tests.sure import sure
@@ -342,25 +343,23 @@ def test_a_drifting_gain_raises_a_data_alarm_and_no_machine_alarm() -> None:
     assert events[-1].alarm.name == "data-gain"
 
 
-def of_sensors(columns: list[int], blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
-    return [replace(block, samples=block.samples[:, columns]) for block in blocks]
+def installed_with(kept: Callable[[Sensor], bool], duration_s: float) -> Installed:
+    machine, healthy = with_sensors(MACHINE, before()[: round(10 * duration_s)], kept)
+    return Installed(machine, None, sure(commissioned(machine, recording(machine, healthy)).commissioned))
 
 
-def with_sensors(columns: list[int], duration_s: float) -> Installed:
-    machine = MACHINE.model_copy(update={"sensors": tuple(MACHINE.sensors[n] for n in columns)})
-    made = commissioned(machine, recording(machine, of_sensors(columns, before()[: round(10 * duration_s)])))
-    return Installed(machine, None, sure(made.commissioned))
+def at_bearing(sensor: Sensor) -> bool:
+    return sensor.location != "disc"
 
 
 def test_with_too_few_sensors_only_a_change_of_shape_and_levels_is_reported() -> None:
-    bearing = [n for n, channel in enumerate(MACHINE.sensors) if channel.location != "disc"]
-    few = with_sensors(bearing, 250.0)
-    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(85.0, SEED + 1)[:650]))
+    few = installed_with(at_bearing, 250.0)
+    windows, events = feed(MachineMonitor(few), with_sensors(MACHINE, stream(85.0, SEED + 1)[:650], at_bearing)[1])
     assert {window.state for window in full(windows)} == {HealthState.UNCHANGED}
     assert not events
     assert all("no equation can be evaluated" in window.reason for window in full(windows))
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.4)
-    windows, events = feed(MachineMonitor(few), of_sensors(bearing, stream(65.0, SEED + 5, softer)))
+    windows, events = feed(MachineMonitor(few), with_sensors(MACHINE, stream(65.0, SEED + 5, softer), at_bearing)[1])
     assert {event.alarm.name for event in events} == {"shape", "level:y1", "level:y1_dot"}
     assert full(windows)[-1].state in {HealthState.ALERT, HealthState.DANGER}
     assert "has changed shape" in full(windows)[-1].reason.partition("; ")[0]
@@ -369,10 +368,9 @@ def test_with_too_few_sensors_only_a_change_of_shape_and_levels_is_reported() ->
 
 @pytest.mark.long  # in short, a wrong gain is no change of a parameter
 def test_swapped_displacement_sensors_are_not_called_healthy() -> None:
-    displacements = [n for n, channel in enumerate(MACHINE.sensors) if channel.quantity != "velocity"]
-    made = with_sensors(displacements, 150.0)
+    made = installed_with(no_velocity, 150.0)
     names = [channel.name for channel in made.machine.sensors]
-    blocks = of_sensors(displacements, stream(65.0, SEED + 6))
+    _, blocks = with_sensors(MACHINE, stream(65.0, SEED + 6), no_velocity)
     samples = samples_of(blocks)
     bearing, disc = names.index("y1"), names.index("y2")
     samples[:, [bearing, disc]] = samples[:, [disc, bearing]]
