@@ -28,6 +28,7 @@ from service.api.routes.tokens import add_session_routes, add_token_routes
 from service.history.records import TokenRecord
 from service.history.store import Store
 from service.settings.access import AccessSettings
+from tests.service.rig import monitored
 from tests.service.rig.postgres import opened
 
 JSON = {"content-type": "application/json"}
@@ -190,8 +191,4 @@ def basic(token: str, user: str = "x") -> dict[str, str]:
 
 
 def problem(answer: httpx.Response, status: int) -> str:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    found = answer.json()
-    assert found["status"] == status
-    return str(found["detail"])
+    return monitored.problem(answer, status).detail
