@@ -369,7 +369,10 @@ class SequentialTest:
         windows = [one for one in self.state.sums[1] if one.known == look.known]
         astride = bool(windows) and windows[-1].end_ns == look.end_ns and windows[-1].start_ns < by_ns - self._slack_ns
         if named and astride:
-            sizes, spreads, since_ns = read_changes(windows, named, hop_ns, by_ns)
+            # A window of both states that does not fit, as with narrow resonances, does not read in proportion to them.
+            most = self.settings.thresholds(self.settings.window_hops).outside
+            fit = next((n for n, one in enumerate(windows) if (one.misfit_z or 0.0) > most), len(windows) - 1)
+            sizes, spreads, since_ns = read_changes([*windows[:fit], windows[-1]], named, hop_ns, by_ns)
             self._date(changed, since_ns)
         inside = astride and look.start_ns == windows[-1].start_ns
         if named and not inside:

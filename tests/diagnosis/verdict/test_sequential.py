@@ -195,6 +195,29 @@ def test_intervals_of_a_window_across_a_change_hold_the_truth() -> None:
     assert sum(dates) >= 34
 
 
+def test_a_change_that_windows_of_both_states_misread_is_quoted_with_what_is_not_known() -> None:
+    """As of narrow resonances: such a window misfits, and later ones read more than their share of the change."""
+    settings, misfits = SequentialSettings(hop_s=5.0, window_hops=12, short_hops=()), range(2, 6)
+    test, hops = SequentialTest(settings), gaussian(SEED + 71, settings)
+    play(test, hops, (24, true()))
+    quoted: list[tuple[int, tuple[float, float]]] = []
+    for since in range(1, 13):
+        share = since / 12
+        size = -0.3 * (share / 2 if since < 6 else 0.7 + 0.6 * (share - 0.5))
+        look = hops.looks(true())[12]
+        sharp = 100 * look.information
+        misfit_z = 6.0 if since in misfits else 0.0
+        look = replace(look, vector=sharp @ true(k_by=size), information=sharp, misfit_z=misfit_z)
+        quoted += [
+            (since, one.interval_95)
+            for one in test.update({12: look}).current
+            if one.name == "k_by" and one.interval_95 and test.state.findings
+        ]
+    after = [interval for since, interval in quoted if since not in misfits and since > 1]
+    assert len(after) >= 5
+    assert all(low <= -0.3 <= high for low, high in after), after
+
+
 @pytest.mark.parametrize("error", [pytest.param(0.002, marks=pytest.mark.long), 0.0002])
 def test_a_precisely_read_change_within_a_hop_keeps_its_size(error: float) -> None:
     """It comes at any moment within a hop; one to eight hops later its size is read within its errors."""
