@@ -109,7 +109,7 @@ class AlarmBook:
     ) -> bool:
         """Judge the sequential test's verdict at the end of a hop; without clean data alarms stay as they are.
 
-        Returns whether a parameter change that operators are told of explains the data without reserve.
+        Returns whether a parameter change, or its repair, that operators are told of explains the data without reserve.
 
         Parameters
         ----------
