@@ -14,7 +14,7 @@ import numpy as np
 
 from models.levels.bands import ERRORS, Growth, band_in_words, growth
 from models.levels.contact import LatestContact
-from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_lines, without_lines
+from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_beats, fallen_by_lines, without_lines
 from models.levels.limits import (
     MEASURE_WORDS,
     PEAK_TO_PEAK,
@@ -245,24 +245,26 @@ class LevelJudge:
         )
 
     def _departure(self, levels: WindowLevels, column: int, state: OperatingState, n_errors: float) -> float:
-        """Departure of a channel's kurtosis from the healthy one; 0 if lines that have grown or gone explain it.
+        """Departure of a channel's kurtosis from the healthy one; 0 if beats, or lines grown or gone, explain it.
 
         The loss of a line explains a kurtosis that has risen to no more than a Gaussian's 3.
         """
-        name, kurtosis = self._channels[column].name, levels.random_kurtosis
-        if kurtosis is None or levels.moments is None:
+        name, kurtosis, shares = self._channels[column].name, levels.random_kurtosis, levels.random_share
+        if kurtosis is None or levels.moments is None or shares is None:
             return 0.0
         hops, healthy = kurtosis[:, column], state.kurtosis[name]
-        found = departure(hops, healthy, n_errors)
+        growth = healthy.growth(shares[:, column])
+        found = departure(hops, healthy, n_errors, growth)
         if found < 0:
             orders, in_bands = levels.moments[2][:, :, column], levels.moments[3][:, :, column]
             strongest = None if levels.lines is None else levels.lines[:, :, column]
             before, speed_rad_s = (state.bands.get(name), state.lines.get(name, ())), levels.speed_rad_s or 0.0
             lines = fallen_by_lines(levels.bands, in_bands, orders, speed_rad_s, *before, strongest)
-            return found if departure(hops + lines, healthy, n_errors) < 0 else 0.0
+            hops = hops + lines + fallen_by_beats(levels.moments[0][:, column], healthy)
+            return found if departure(hops, healthy, n_errors) < 0 else 0.0
         if found and healthy.mean < GAUSSIAN:
             random = without_lines(healthy)
-            return found if departure(hops, random, n_errors) > 0 else 0.0
+            return found if departure(hops, random, n_errors, growth) > 0 else 0.0
         return found
 
     def _channel(

@@ -15,6 +15,10 @@ from pydantic import BaseModel, Field
 from models.levels.bands import BEYOND_RANGE, LINE, OF_BIN, BandLevels, BandReference
 from models.signals.block import BoolArray, ComplexArray, FloatArray
 
+GAUSSIAN = 3.0
+_LEAST_SHARE = 0.05
+"""Share of the random part below which noise at the orders, rather than the random part's own cumulant, makes kurtosis
+scatter: in white noise it then grows with the root of the share."""
 _PIECES, _APART = 20, 2
 """Pieces of a hop whose levels are compared, each with the next but one: in between, ringing after an impact dies."""
 
@@ -47,6 +51,16 @@ def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: ComplexArray)
     return np.asarray(found, dtype=np.float64)
 
 
+def random_share(square: FloatArray, lines: ComplexArray) -> FloatArray:
+    """Share of the power that is not in the lines, shape (n_hops, n); arguments as of `random_kurtosis`.
+
+    Its square scales the random part's fourth cumulant, and the scatter of that, in the kurtosis of the whole.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = 1 - (np.abs(lines) ** 2).sum(axis=1) / (2 * square)
+    return np.asarray(found, dtype=np.float64)
+
+
 class HopReference(BaseModel, extra="forbid", frozen=True, strict=True):
     """A statistic of a channel's hops in the healthy windows: kurtosis, or contact (`models.levels.contact`)."""
 
@@ -54,19 +68,34 @@ class HopReference(BaseModel, extra="forbid", frozen=True, strict=True):
     scatter: float = Field(ge=0, allow_inf_nan=False)  # standard deviation of one hop
     hops: int = Field(ge=2)  # how many were seen
     range: float = Field(ge=0, allow_inf_nan=False)  # largest distance of a window's mean from `mean`
+    # Of kurtosis: root mean square of the `random_share`; older commissionings did not keep it.
+    share: float | None = Field(default=None, ge=0, allow_inf_nan=False, exclude_if=lambda found: found is None)
+
+    def growth(self, shares: FloatArray) -> float:
+        """Factor by which kurtosis scatters more by chance if the random part has these shares of the power; 1 or more.
+
+        The newest half of the hops counts by itself, because the share may have grown within the window.
+        """
+        if self.share is None:
+            return 1.0
+        now = max(float(shares.mean()), float(shares[len(shares) // 2 :].mean()))
+        return max(1.0, now / max(self.share, _LEAST_SHARE)) ** 2
 
 
-def learn_hops(windows: Sequence[FloatArray]) -> HopReference | None:
-    """Learn from a channel's hops in healthy windows; None if one has no value, or there are fewer than two."""
+def learn_hops(windows: Sequence[FloatArray], shares: Sequence[FloatArray] = ()) -> HopReference | None:
+    """Learn from a channel's hops in healthy windows; None if one has no value, or there are fewer than two.
+
+    `shares` are their `random_share`, if the statistic is a kurtosis.
+    """
     values = np.concatenate(windows)
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
     mean, scatter = float(values.mean()), float(values.std(ddof=1))
     farthest = max(abs(float(window.mean()) - mean) for window in windows)
-    return HopReference(mean=mean, scatter=scatter, hops=values.size, range=farthest)
+    share = float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else None
+    return HopReference(mean=mean, scatter=scatter, hops=values.size, range=farthest, share=share)
 
 
-GAUSSIAN = 3.0
 _STEADIER = 0.3
 """A band holds a line if its power scatters by less than this fraction of the scatter of noise; 1 % of noise does."""
 _STEPS = 2
@@ -119,6 +148,17 @@ def fallen_by_lines(
     return np.asarray(1.5 * fallen, dtype=np.float64)
 
 
+def fallen_by_beats(square: FloatArray, healthy: HopReference) -> float:
+    """How much the beats of narrow modes lower a channel's kurtosis by more than on the healthy machine.
+
+    They make the mean square of a hop, `square`, shape (n_hops,), vary by chance, by which the mean of its square, the
+    denominator of kurtosis, exceeds the square of its mean. Only steps between hops count, no slow change of the load.
+    """
+    varies = float(np.mean(np.diff(square) ** 2)) / 2 if len(square) > 1 else 0.0
+    lowered = GAUSSIAN * varies / max(float(square.mean()) ** 2, np.finfo(float).tiny)
+    return max(0.0, lowered - max(0.0, GAUSSIAN - healthy.mean))
+
+
 def _holds_line(power: FloatArray, freedom: FloatArray) -> BoolArray:
     """Which columns hold the power of a line: the same in every hop, except where it begins or ends.
 
@@ -139,17 +179,18 @@ def without_lines(healthy: HopReference) -> HopReference:
     return healthy.model_copy(update={"mean": GAUSSIAN, "scatter": float(scatter)})
 
 
-def departure(hops: FloatArray, reference: HopReference, n_errors: float) -> float:
+def departure(hops: FloatArray, reference: HopReference, n_errors: float, growth: float = 1.0) -> float:
     """Difference of a window's newest half, or all of it, from the healthy mean; 0 within `n_errors` standard errors.
 
     It must persist without the hop that departs most: a hop in which the level steps, or the machine stops, mixes two
-    vibrations and has a large kurtosis of its own, and a single impact is no state of a machine.
+    vibrations and has a large kurtosis of its own, and a single impact is no state of a machine. What rises must exceed
+    a scatter greater than the healthy one by the factor `growth`.
     """
 
     def beyond(kept: FloatArray) -> float:
         difference = float(kept.mean()) - reference.mean
         # What falls and scatters more is no clipping: the random part has grown, or its resonances are narrower.
-        scatter = reference.scatter if difference > 0 else max(reference.scatter, float(kept.std()))
+        scatter = reference.scatter * growth if difference > 0 else max(reference.scatter, float(kept.std()))
         by_chance = n_errors * scatter * np.sqrt(1 / len(kept) + 1 / reference.hops)
         limit = max(by_chance, BEYOND_RANGE * reference.range * np.sqrt(len(hops) / len(kept)))
         return difference if abs(difference) > limit else 0.0

@@ -39,7 +39,7 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.levels.bands import ERRORS, NEIGHBOURHOOD, NYQUIST_PART, BandLevels, band_edges
-from models.levels.kurtosis import random_kurtosis, swell
+from models.levels.kurtosis import random_kurtosis, random_share, swell
 from models.levels.orders import ORDERS, Spectrum, hann_taper, order_vectors, without_orders
 from models.signals.block import BoolArray, ComplexArray, FloatArray, IndexArray, SampleArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
@@ -333,6 +333,11 @@ class WindowLevels:
     def random_kurtosis(self) -> FloatArray | None:
         """See `models.levels.kurtosis`; shape (n_hops, n)."""
         return None if self.moments is None else random_kurtosis(*self.moments[:3])
+
+    @property
+    def random_share(self) -> FloatArray | None:
+        """See `models.levels.kurtosis`; shape (n_hops, n)."""
+        return None if self.moments is None else random_share(self.moments[0], self.moments[2])
 
     @property
     def hidden_twice(self) -> BoolArray | None:

@@ -154,7 +154,6 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
     looked, lines = [parts for one in group if (parts := one.line_parts) is not None], np.empty((0, 0))
     if len(looked) == len(group):
         lines = learn_lines(looked, group[0].bands, group[0].hops, max(one.unsteady for one in group))
-    kurtosis, contact = [one.random_kurtosis for one in group], [one.contact for one in group]
     return OperatingState(
         windows=len(group),
         speed_rad_s=(min(speeds), max(speeds)) if speeds else None,
@@ -170,21 +169,24 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
             if (own := [one.bands for one in group if np.isfinite(one.bands.rms[:, column]).all()])
         },
         lines=dict(zip(channels, map(tuple, lines.T.round(3).tolist()), strict=False)),  # of all channels, or none
-        kurtosis=_hops(channels, kurtosis),
+        kurtosis=_hops(channels, [one.random_kurtosis for one in group], [one.random_share for one in group]),
         contact={
             # A scatter as in theory at least; and a push outwards, which has another cause, must not hide one inwards.
             name: one.model_copy(update={"mean": max(0.0, one.mean), "scatter": max(1.0, one.scatter)})
-            for name, one in _hops(channels, contact).items()
+            for name, one in _hops(channels, [one.contact for one in group]).items()
         },
     )
 
 
-def _hops(channels: Sequence[str], windows: Sequence[FloatArray | None]) -> dict[str, HopReference]:
+def _hops(
+    channels: Sequence[str], windows: Sequence[FloatArray | None], shares: Sequence[FloatArray | None] = ()
+) -> dict[str, HopReference]:
     """Hop references of the channels that have values in all windows; empty if a window has none at all."""
-    known = [one for one in windows if one is not None]
+    known, parts = ([one for one in values if one is not None] for values in (windows, shares))
     if len(known) < len(windows):
         return {}
-    learned = [learn_hops([one[:, column] for one in known]) for column in range(len(channels))]
+    columns = range(len(channels))
+    learned = [learn_hops([one[:, at] for one in known], [one[:, at] for one in parts]) for at in columns]
     return {channel: one for channel, one in zip(channels, learned, strict=True) if one is not None}
 
 
