@@ -272,7 +272,8 @@ class KnownMachineEvaluator(WindowEvaluator):
         if deciding.unexplained:
             # If some of the window's data were explained, it may straddle a change: the shortest stretch shows that.
             straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
-            wanted = tuple(sorted(wanted)[: int(straddles)])
+            dated = wanted != test.settings.short_hops
+            wanted = wanted[: len(wanted) if straddles and dated else int(straddles)]
         elif test.unchanged and not closely and not self._likelihood.has_news(sliding, window, wanted):
             return {}
         for hops in wanted:

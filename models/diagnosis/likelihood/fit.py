@@ -101,7 +101,7 @@ class LikelihoodFit:
         """Start the next window where another fit of the same machine has ended: `anew`, or if the noise is another."""
         if anew or self._corners != other._corners:
             self._last, self._strengths, self._line = other._last, other._strengths, None
-            self._corners = other._corners
+            self._corners, self._followed, self._misfits = other._corners, 1, 0  # as if it had been followed there
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""

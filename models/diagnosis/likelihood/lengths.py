@@ -99,6 +99,9 @@ class LengthFits:
         if seen is not None:
             return seen
         fit = self._short.setdefault(hops, LikelihoodFit(self._machine, sized=self._sized))
-        fit.start_near(self._window, anew=self._searched.get(hops) != self._hop - 1)
+        latest = [length for length, hop in self._searched.items() if hop == self._hop - 1]
+        # After a change the window mixes two machines: a shorter stretch since then ended nearer to the new one.
+        nearest = max((length for length in latest if length < hops), default=None)
+        fit.start_near(self._window if nearest is None else self._short[nearest], anew=hops not in latest)
         self._searched[hops] = self._hop
         return fit.diagnose(stretch)

@@ -115,8 +115,8 @@ class SequentialTest:
     def wanted(self) -> tuple[int, ...]:
         """Lengths, in hops, of the short stretches worth evaluating at the next hop; each costs as much as a window.
 
-        On an unchanged machine these are all of them; after a change, the longest clean one or, before there is one,
-        the shortest.
+        On an unchanged machine these are all of them; after a change, the longest clean one and the shortest, which
+        shows if the change goes on.
         """
         short, state = self.settings.short_hops, self.state
         if not short:
@@ -126,7 +126,8 @@ class SequentialTest:
             hop_ns = self.settings.hop_s * 1e9
             next_hops = (windows[-1].end_ns - state.change_ns + self._slack_ns + hop_ns) // hop_ns
             if next_hops < self.settings.window_hops:
-                return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
+                longest = max((hops for hops in short if hops <= next_hops), default=short[0])
+                return tuple(sorted({short[0], longest}))
         return short
 
     @property

@@ -25,6 +25,7 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from tests.diagnosis.verdict.gaussian_hops import GaussianHops, play, true
 from tests.diagnosis.verdict.test_isolation import covariance, window
+from tests.sure import sure
 
 SEED = 88_300
 SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
@@ -101,6 +102,16 @@ def test_delays_are_within_twice_those_of_a_fixed_length_test(name: str, change:
         assert all(names in ([], [name]) for _, names in found)
         named_s.append(min((delay_s for delay_s, names in found if names), default=np.inf))
     assert np.quantile(named_s, 0.95) <= (within_s or 2 * fixed_length_s(name, change))
+
+
+def test_a_change_that_goes_on_is_read_without_the_data_of_its_course() -> None:
+    """Stiffness that falls over 30 s, with the errors of one source, is read right as soon as two hops have passed."""
+    hops = GaussianHops(SETTINGS, COVARIANCE / 100, np.random.default_rng(SEED + 3))
+    course = [(1, true(k_by=-0.03 * n)) for n in range(1, 6)]
+    verdicts = play(SequentialTest(SETTINGS), hops, (24, true()), *course, (12, true(k_by=-0.18)))
+    for _, verdict in verdicts[-11:]:
+        (read,) = (one for one in verdict.current if one.name == "k_by")
+        assert read.relative_change == pytest.approx(-0.18, abs=4 * sure(read.standard_error))
 
 
 def test_a_small_change_accumulates_over_windows() -> None:
