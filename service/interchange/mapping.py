@@ -62,7 +62,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
     )
     zone: str | None = Field(
         default=None,
-        description="time zone of dates and times without one, in the file and in file names, such as "
+        description="time zone of dates and times without one, in start, the file and file names, such as "
         "Europe/Berlin or +01:00; UTC if left out",
     )
     rate_hz: float | None = Field(default=None, gt=0, le=1e6, description="samples per second where no column says so")
@@ -83,8 +83,10 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if isinstance(self.start, datetime) and self.start.tzinfo is None:
-            raise ValueError(f"start {self.start.isoformat()} has no time zone, expected UTC such as {self.start}Z")
+        # The zero of a spreadsheet's day numbers stays refused: one offset is not that of summer and winter.
+        if isinstance(self.start, datetime) and self.start.tzinfo is None and (not self.zone or self.start.year < 1970):
+            told = f"start {self.start.isoformat()} has no time zone, expected UTC such as {self.start}Z"
+            raise ValueError(told if self.zone else f"{told}, or local time with time.zone")
         if self.rate_hz is not None and self.rate_from is not None:
             raise ValueError("rate_hz and rate_from are both given, expected one of them")
         if self.unit == _DATETIME:
@@ -118,7 +120,7 @@ class TimeBase(BaseModel, extra="forbid", frozen=True):
             return None
         if not isinstance(self.start, datetime):
             return _ZEROS_NS[self.start]
-        return nanoseconds(self.start)
+        return nanoseconds(self.start if self.start.tzinfo else self.start.replace(tzinfo=self.time_zone))
 
 
 class Column(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
@@ -271,7 +273,12 @@ class Mapping(BaseModel, extra="forbid", frozen=True):
             try:
                 unit_factor(quantity, column.unit)
             except ValueError as error:
-                raise ValueError(f"{field}.unit: {error}") from error
+                raise ValueError(f"{field}.unit: {error}{of_voltage(column.unit)}") from error
+
+
+def of_voltage(unit: str) -> str:
+    """What to do about a unit that was refused: a hint if it is that of a sensor's voltage, else empty."""
+    return "; of a sensor's voltage, give unit and scale in the mapping" if unit in {"V", "mV"} else ""
 
 
 def load_mapping(path: Path, machine: MachineFile) -> Mapping:

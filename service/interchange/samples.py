@@ -12,7 +12,7 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity, same_unit, unit_factor
 from service.interchange.clock import Clock, check_order
-from service.interchange.mapping import Column, Mapping
+from service.interchange.mapping import Column, Mapping, of_voltage
 from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
 
 # Largest number of isolated rows, i.e. with a gap on both sides, as part of all and in any file.
@@ -248,8 +248,8 @@ def _unit(source: Source, column: Column, name: str, quantity: str) -> tuple[str
         try:
             unit_factor(quantity, stated)
         except ValueError as error:
-            volts = "; of a sensor's voltage, give unit and scale in the mapping" if stated in {"V", "mV"} else ""
-            raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}{volts}") from error
+            told = f"{source.path}: column {reference}, channel {name}: {error}{of_voltage(stated)}"
+            raise SourceError(told) from error
         return stated, ""
     if not stated or column.scale != 1 or column.scale_from is not None:
         return column.unit, ""

@@ -20,6 +20,8 @@ _HEAD = 100  # rows after which a line with too few cells is no sign of a wrong 
 _NO_ROW = "; delete this line if it is no whole row"
 _NUMBER = r"[-+]?[\d.,]+([eE][-+]?\d+)?"
 _GROUPED = r"[-+]?\d{1,3}([.,' ]\d{3})+([.,]\d+)?"  # a number such as 1,899.62, with separators of thousands
+_DOTTED_DATE = r"^(\d\d)\.(\d\d)\.(\d{4})\b", r"\3-\2-\1"  # dots mean that the day comes first
+_DECIMAL_COMMA = r"(:\d\d),(\d)", r"\1.\2"  # also a sign of ISO 8601, which Arrow does not read
 _ZONED = r"(Z|[T ].*[+-]\d\d(:?\d\d)?)$"
 
 
@@ -50,8 +52,8 @@ class _Table(Source):
 class CsvSource(_Table):
     """A text table. Columns without a header are named ``1``, ``2`` and so on.
 
-    With `datetimes`, the time column has ISO 8601 times, in `zone` unless they state one. If its first cells are
-    integers it is read as such, because nanoseconds since 1970 have more digits than a float.
+    With `datetimes`, the time column has ISO 8601 times or dates such as 31.01.2026, in `zone` unless they state one.
+    If its first cells are integers it is read as such, because nanoseconds since 1970 have more digits than a float.
     """
 
     kind = "CSV"
@@ -240,7 +242,9 @@ class ParquetSource(_Table):
 
 
 def _utc(cells: Any, zone: str) -> Any:
-    """Convert ISO 8601 texts to Arrow timestamps in UTC; those without a zone are in `zone`."""
+    """Convert ISO 8601 texts, or dates such as 31.01.2026, to Arrow timestamps in UTC; without a zone, in `zone`."""
+    for written, iso in _DOTTED_DATE, _DECIMAL_COMMA:
+        cells = pa.compute.replace_substring_regex(cells, written, iso)
     zoned = pa.compute.match_substring_regex(cells, _ZONED)
     in_utc = pa.compute.binary_join_element_wise(cells, "Z", "")
     times = pa.compute.if_else(zoned, cells, in_utc).cast(pa.timestamp("ns", tz="UTC"))

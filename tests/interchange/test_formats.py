@@ -235,6 +235,14 @@ def test_dates_in_a_parquet_file_have_their_own_time_zone_or_the_mappings(
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
 
 
+def test_a_start_without_a_time_zone_is_in_that_of_the_mapping(tmp_path: Path) -> None:
+    _, x, v, a = signals(3000)
+    np.savez(tmp_path / "run.npz", x=x, v=v, a=a)
+    mapping = f'{SAMPLED.replace(START, START[:-1])}zone = "America/New_York"\n{CHANNELS}'
+    (found,) = stretches(imported(tmp_path, tmp_path / "run.npz", mapping)[1])
+    assert found.start_ns == START_NS + 5 * 3600 * 10**9
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # asammdf's own
 @pytest.mark.parametrize("form", ["npz", "mf4", "mdf"])
 def test_dates_without_a_time_zone_are_in_that_of_the_mapping(tmp_path: Path, form: str) -> None:
@@ -259,7 +267,7 @@ def test_dates_without_a_time_zone_are_in_that_of_the_mapping(tmp_path: Path, fo
 
 
 @pytest.mark.parametrize(
-    "written", ["dates", "bare dates", "mixed dates", "local dates", "nanoseconds", "milliseconds"]
+    "written", ["dates", "bare dates", "mixed dates", "local dates", "German dates", "nanoseconds", "milliseconds"]
 )
 def test_columns_of_a_text_table_without_names_are_numbered(tmp_path: Path, written: str) -> None:
     _, x, v, angle = signals(3000)
@@ -274,6 +282,7 @@ def test_columns_of_a_text_table_without_names_are_numbered(tmp_path: Path, writ
                 "bare dates": date.replace("T", " "),
                 "mixed dates": (date, f"{date}Z", ahead)[row % 3],
                 "local dates": (ahead.removesuffix("+01:00"), ahead, f"{date}Z")[row % 3],
+                "German dates": f'"{datetime.fromtimestamp(second, UTC):%d.%m.%Y %H:%M:%S},{rest:09d}"',
                 "nanoseconds": str(time_ns),
                 "milliseconds": str(row / 2),
             }

@@ -105,8 +105,8 @@ def test_day_numbers_of_matlab_and_spreadsheets_are_times(tmp_path: Path, start:
         ([f"{number / 1980.2:.5f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "run.csv: has 1980.22 samples per second",
         )),
-        (["31.01.2026 12:00:00,1.0,2.0,3.0"], TEXT.replace(f'start = "{START}"', 'unit = "datetime"'), HEADER, (
-            "found '31.01.2026 12:00:00', expected an ISO 8601 time, or no time column but time.start and time.rate_hz",
+        (["01/31/2026 12:00:00,1.0,2.0,3.0"], TEXT.replace(f'start = "{START}"', 'unit = "datetime"'), HEADER, (
+            "found '01/31/2026 12:00:00', expected an ISO 8601 time, or no time column but time.start and time.rate_hz",
         )),
         ([f"2026-01-31T12:00:{number / 2000:09.6f},1.0,2.0,3.0" for number in range(1000)], TEXT, HEADER, (
             "row 1, column 't': found '2026-01-31T12:00:00.000000', expected a number", 'time.unit = "datetime"',
@@ -123,7 +123,7 @@ def test_day_numbers_of_matlab_and_spreadsheets_are_times(tmp_path: Path, start:
         *("no number", "thousands", "unit line", "names", "no names", "comma", "short row"),
         *("last line", "same name", "other signs"),
         *("time goes back", "no second time", "no time", "half the rate", "few decimals"),
-        *("other rate", "rate contradicts times", "five decimals", "days first", "dates"),
+        *("other rate", "rate contradicts times", "five decimals", "slashes", "dates"),
         *("no row", "one row", "uneven", "no start", "1900", "2300", "9999"),
     ],
 )  # fmt: skip
@@ -150,7 +150,9 @@ def test_a_file_of_another_rate_is_refused_before_its_gaps_fill_the_memory(
         ('"um"', '"mm/s"', r"channels.y1.unit: unit 'mm/s' is a unit of velocity, not of displacement"),
         ('"um"', '"mil pp"', "is that of an overall value (pp)"),
         ('"mm/s"', '"mm/s rms"', "is that of an overall value (rms)"),
-        ("12:00:00Z", "12:00:00", "has no time zone"),
+        ("12:00:00Z", "12:00:00", "has no time zone, expected UTC such as 2026-01-31 12:00:00Z, or local time with"),
+        (f'"{START}"', '"1899-12-30T00:00:00"\nzone = "Europe/Berlin"', "1899-12-30T00:00:00 has no time zone"),
+        ('"um"', '"mV"', "of a sensor's voltage, give unit and scale in the mapping"),
         ('{ column = "x", unit = "um" }', '{ column = "x", unit = "um", scale = 0 }', "scale is 0"),
         ("[channels]", '[keyphasor]\npulse_times = "k"\n[channels]', "channels.theta: expected [channels.theta], or a"),
         ('"v"', '"x"', "channels.y1_dot: column 'x' is that of channel y1 already; expected that of another sensor"),
