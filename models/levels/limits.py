@@ -19,7 +19,7 @@ from models.levels.bands import BEYOND_RANGE, ERRORS, NYQUIST_PART, BandLimits, 
 from models.levels.measures import LevelPlan, WindowLevels, level_plan
 from models.levels.orders import ORDERS
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
-from models.levels.settings import LevelSettings
+from models.levels.settings import ZONES, LevelSettings
 from models.mistakes import did_you_mean
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
@@ -226,13 +226,14 @@ def all_rounded(values: FloatArray) -> list[list[float | None]]:
 
 
 _QUANTITIES: dict[str, tuple[Quantity, ...]] = {"mean": (Quantity.DISPLACEMENT, Quantity.TILT)}
+_NO_SPEED = ": the running speed is not known, expected a shaft angle or [operation] speed_rpm"
 _QUANTITIES |= dict.fromkeys(("velocity", "high", "envelope"), (Quantity.ACCELERATION,))
 
 
 def unmeasured(
     settings: LevelSettings, sensors: Sequence[Channel], rate_hz: float, speed_rpm: float | None
 ) -> str | None:
-    """Describe the first band or limit without a level, if there is one; orders need an angle or a nominal speed."""
+    """Describe the first band, zone or limit without a level; orders and a shaft's zones need an angle or a speed."""
     band_hz, end_hz = settings.band(speed_rpm), NYQUIST_PART * rate_hz / 2
     if settings.band_hz is not None and band_hz[0] >= end_hz:
         return f"levels.band_hz begins at {band_hz[0]:g} Hz, expected below 0.4 of rate_hz, {end_hz:g} Hz"
@@ -240,6 +241,13 @@ def unmeasured(
     plan = level_plan(channels, rate_hz, band_hz)
     turning = speed_rpm is not None or len(channels) < len(sensors)
     names = [one.name for one in channels]
+    for zone in settings.zones:
+        shaft = ZONES[zone].shaft
+        wanted = (Quantity.DISPLACEMENT,) if shaft else (Quantity.VELOCITY, Quantity.ACCELERATION)
+        if not any(one.quantity in wanted for one in channels):
+            return f"levels.zones: {zone} applies to no channel, expected one of {' or '.join(wanted)}"
+        if shaft and not turning:
+            return f"levels.zones: {zone}{_NO_SPEED}"
     for limit in settings.limits:
         if limit.channel not in names:
             hint = did_you_mean(limit.channel, names)
@@ -259,5 +267,5 @@ def _missing(plan: LevelPlan, column: int, measure: str, *, turning: bool) -> st
     if measure == "s_max" and column not in [first for first, _ in plan.pairs]:
         return ": expected the first of two displacements of one place in two directions"
     if measure in ORDERS and not turning:
-        return ": the running speed is not known, expected a shaft angle or [operation] speed_rpm"
+        return _NO_SPEED
     return None

@@ -35,6 +35,8 @@ FAN = (
     "--sensor", "DE-H acceleration g DE horizontal", "--sensor", "NDE-V velocity mm/s NDE vertical",
 )  # fmt: skip
 
+PROBE = ("--sensor", "DE-X displacement um DE X")
+
 
 def blocks(seconds: float, rate_hz: float = RATE_HZ, every_s: float = 0.5) -> Iterator[tuple[SampleBlock, tuple[()]]]:
     rng, size = np.random.default_rng(95), round(0.5 * rate_hz)
@@ -89,6 +91,8 @@ def test_init_writes_files_that_other_commands_accept(tmp_path: Path) -> None:
         ((*FAN, "--snapshots", "10"), "--snapshots '10' has 1 words, expected two, such as '0.1 10'"),
         ((*FAN, "--snapshots", "10 5"), "on_s 10 must be below every_s 5"),
         ((*FAN, "--zones", "ISO 20816-3 group 2 stiff"), "is not one of"),
+        ((*FAN, "--zones", "ISO 20816-3 shaft"), "shaft applies to no channel, expected one of displacement"),
+        ((*FAN, "--zones", "ISO 20816-3 shaft", *PROBE), "ISO 20816-3 shaft: the running speed is not known"),
         (("init", "--site", "a plant", *FAN[3:]), "a plant"),
     ],
 )
