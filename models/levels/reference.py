@@ -241,6 +241,13 @@ class FirstWindows:
         states = () if self.reference is None else self.reference.states
         return not states or (self._turns and all(state.speed_rad_s is None for state in states))
 
+    @property
+    def progress(self) -> str:
+        """What the reference rests on so far, in words."""
+        if self.reference is None:
+            return f"{len(self._seen)} of {self._count} first windows, so no limit is relative to this machine yet"
+        return f"levels are compared with {self._source}, until {np.datetime64(self._end_ns, 'ns').astype('M8[s]')}Z"
+
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
         """Learn from a full window, if it is still needed and does not overlap the last one."""
         before = self.reference

@@ -57,6 +57,11 @@ class OfflineSummary(Record):
     descriptor_differences: tuple[str, ...] = Field(
         description="how the recorded channel descriptor differs from the machine file", examples=[[]]
     )
+    first_windows: str = Field(
+        default="",
+        description="how far the first windows have come, if levels are compared with them; else empty",
+        examples=["levels are compared with the first windows, until 2026-01-01T00:05:05Z"],
+    )
     limits: dict[str, ParameterLimits] = Field(
         default={},
         description="limits in use, by parameter; those of levels are in the reports",

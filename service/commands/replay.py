@@ -309,6 +309,8 @@ def summary_lines(summary: "OfflineSummary") -> Iterator[str]:
         yield f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up"
     if summary.gaps:
         yield f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing"
+    if summary.first_windows:
+        yield summary.first_windows
     if summary.stopped:
         yield "stopped before the end"
     yield f"SHA-256 of the lines {summary.sha256}"

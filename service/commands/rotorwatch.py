@@ -309,7 +309,7 @@ def demo(
 
 def _checked(file: Path) -> str:
     """Check a file, and return a description of its contents."""
-    from models.commissioning.commissioned import install, knowledge_of  # noqa: PLC0415  # keeps --help quick
+    from models.commissioning.commissioned import Installed, install, knowledge_of  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
     from service.access.tls import lapses, tls_context  # noqa: PLC0415
@@ -324,7 +324,12 @@ def _checked(file: Path) -> str:
         window, (low_hz, high_hz) = machine.window, machine.window.band_hz
         lengths = f"windows of {window.length_s:g} s every {window.hop_s:g} s, segments of {window.segment_s:g} s"
         spectra = f"{lengths}, {low_hz:g} to {high_hz:g} Hz"
-        return f"machine {machine.title}, {channels}; {spectra}; knowledge level {known.level}: {known.text}"
+        found = f"machine {machine.title}, {channels}; {spectra}; knowledge level {known.level}: {known.text}"
+        levels = machine.levels
+        if levels.reference == "commissioned" or (levels.reference is None and not Installed(machine).watching):
+            return found
+        first = f"the first {levels.reference_windows} windows, {levels.reference_windows * window.length_s:g} s"
+        return f"{found}; levels are compared with {first}{'' if levels.reference else ', until it is commissioned'}"
     settings = load_settings(file)
     names = []
     for entry in settings.machines:

@@ -83,6 +83,11 @@ class LevelWatch:
         return self._first.reference if self._takes_first else self._commissioned
 
     @property
+    def first_windows(self) -> str:
+        """How far the first windows have come, in words; empty if they are not the reference."""
+        return self._first.progress if self._takes_first else ""
+
+    @property
     def _several_speeds(self) -> bool:
         """Whether the reference holds speeds so far apart that lines lay in different bands."""
         states = () if self.reference is None else self.reference.states

@@ -237,6 +237,11 @@ class MachineMonitor:
         return self._reporter.window
 
     @property
+    def first_windows(self) -> str:
+        """How far the first windows, if levels are compared with them, have come, in words; else empty."""
+        return self._levels.first_windows
+
+    @property
     def blocks_to_hop(self) -> int:
         """How many more blocks as long as the latest one complete the next hop, at least one; little changes before."""
         return 1 if self._used is None else max(1, -(-self._window.lacking // self._used.samples.shape[0]))

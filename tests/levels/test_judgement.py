@@ -227,6 +227,7 @@ def test_a_channel_clears_only_below_the_deadband() -> None:
 def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
     first = FirstWindows(["DE-H"], 3)
     for number in range(5):  # each overlaps the one before by half
+        assert first.progress == f"{(number + 1) // 2} of 3 first windows, so no limit is relative to this machine yet"
         first.take(number * 30, number * 30 + 60, window(overall=1e-3 * (1 + number), x1=1e-6j))
         again = FirstWindows(["DE-H"], 3)
         again.restore(first.checkpoint())
@@ -235,6 +236,7 @@ def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
     level = first.reference.states[0].levels["DE-H"]["overall"]
     assert (level.low, level.high) == (1e-3, 5e-3)
     assert first.reference.source == "the first windows"
+    assert first.progress == "levels are compared with the first windows, until 1970-01-01T00:00:00Z"
 
 
 @pytest.mark.parametrize(("times", "learned"), [(3.0, [True]), (5.0, [True, False])])

@@ -161,6 +161,7 @@ class OfflineReplay:
             elapsed_s=round(elapsed_s, 3),
             times_real_time=round(self._data_s / max(elapsed_s, 1e-9), 1),
             descriptor_differences=self.descriptor_differences,
+            first_windows=self._monitor.first_windows,
             limits={
                 name: ParameterLimits(**self._machine.alarms.for_parameter(name).model_dump()) for name in PARAMETERS
             },

@@ -71,12 +71,15 @@ def test_offline_replay_with_another_machine_file_and_limit(faulty: Path, tmp_pa
     """Another machine name is reported and evaluated; with a higher limit the alarm is not raised."""
     file = machine_file(tmp_path, ('name = "lab"', 'name = "lab2"'))
     calm = "alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}"
-    found = run(faulty, "--offline", "--machine", file, "--set", calm, "--out", tmp_path / "out.jsonl")
+    first = 'levels.reference = "first windows"'
+    changes = ("--set", calm, "--set", first)
+    found = run(faulty, "--offline", "--machine", file, *changes, "--out", tmp_path / "out.jsonl")
     assert found.returncode == 0, found.stderr
     assert "machine is 'lab', expected 'lab2'" in found.stderr
     assert "demo/lab2" in found.stderr
     assert "0 alarm events, raised at the end: none" in found.stderr
     assert "800 blocks accepted, refused: none" in found.stderr
+    assert "1 of 5 first windows, so no limit is relative to this machine yet" in found.stderr
 
 
 def test_mismatching_channels_are_named(faulty: Path, tmp_path: Path) -> None:

@@ -91,6 +91,8 @@ def test_check_config_reports_valid_and_invalid_files(tmp_path: Path) -> None:
     found = "9 channels at 2000 Hz; windows of 60 s every 5 s, segments of 5 s, 3 to 150 Hz; knowledge level full"
     assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, {found}" in fine.stdout
     assert "knowledge level none: [rotor] lacks I2p_kg_m2" in fine.stdout
+    compared = "levels are compared with the first 5 windows, 300 s, until it is commissioned"
+    assert [compared in line for line in fine.stdout.splitlines()] == [False, False, True]
     elsewhere = tmp_path / "elsewhere.toml"
     elsewhere.write_text('[http]\nhost = "192.0.2.1"\n', encoding="utf-8")  # of documentation: no computer's
     there = run("check-config", str(elsewhere))
