@@ -1,7 +1,7 @@
 """Examines a machine's stream as it arrives, without a monitor."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -26,10 +26,12 @@ _MOST_BREAKS = 3
 """Most breaks in the stream that are reported individually."""
 
 
-def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> tuple[list[str], list[str]]:
+def examined(
+    machine: MachineFile, messages: Sequence[RecordedMessage], others: Collection[str] = ()
+) -> tuple[list[str], list[str]]:
     """What arrives under a machine's keys, in words, and what is missing or differs from the machine file.
 
-    The messages are given in order of arrival.
+    The messages are given in order of arrival; `others` are the keys of other streams.
     """
     place, keys = machine.title, machine.keys
     troubles: list[str] = []
@@ -42,8 +44,8 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> tuple
     troubles += descriptor_mismatch(announced[-1], machine) if announced else ()
     stream = [one for one in messages if one.key == keys.stream]
     if not stream:
-        others = sorted({one.key for one in messages})
-        heard = f"; heard were {', '.join(others)}" if others else ""
+        keys_heard = sorted({*others, *(one.key for one in messages)})
+        heard = f"; heard were {', '.join(keys_heard)}" if keys_heard else ""
         return [f"{place}: no sample blocks"], [f"nothing arrived under {keys.stream}{heard}", *troubles]
     gate, missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
     refused, rates = defaultdict[str, list[str]](list), set[float]()

@@ -197,7 +197,7 @@ def doctor(
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.signals.recording import RecordedMessage  # noqa: PLC0415
     from service.analysis.arrival import examined  # noqa: PLC0415
-    from service.stream.transport import Link, LinkError, tap  # noqa: PLC0415
+    from service.stream.transport import Link, LinkError, streams_heard, tap  # noqa: PLC0415
 
     known = load_machine_file(machine)
     listening = listen or ([] if connect or link else [ENDPOINT])
@@ -215,9 +215,12 @@ def doctor(
         sys.stdout.flush()
         time.sleep(seconds)
         close()
+        # The commonest cause of silence is another site or name. All streams may be many: they are heard for 2 s.
+        silent = all(one.key != known.keys.stream for one in heard)
+        others = streams_heard(session, 2.0) if silent else ()
     finally:
         session.close()
-    lines, troubles = examined(known, heard)
+    lines, troubles = examined(known, heard, others)
     for line in lines:
         typer.echo(line)
     for trouble in troubles:

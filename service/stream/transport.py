@@ -281,6 +281,18 @@ def tap(link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], N
     return close
 
 
+def streams_heard(link: Link, seconds: float) -> set[str]:
+    """Keys under which sample blocks of any machine arrive within a time."""
+    heard = set[str]()
+
+    def take(sample: zenoh.Sample) -> None:
+        heard.add(str(sample.key_expr))
+
+    with link.session.declare_subscriber(f"{PREFIX}/*/*/stream", link.guarded(take)):
+        time.sleep(seconds)
+    return heard
+
+
 @contextmanager
 def follow(
     settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]

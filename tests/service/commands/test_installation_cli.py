@@ -146,6 +146,15 @@ def test_the_doctor_reports_a_wrong_rate_and_missing_data(tmp_path: Path) -> Non
     assert "no publisher answers a query for it (docs/wire.md)" in silent.stdout
 
 
+def test_the_doctor_names_the_stream_of_a_machine_with_another_name(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path))
+    other, address = tmp_path / "other.toml", endpoint()
+    other.write_text((tmp_path / "fan.toml").read_text().replace('name = "fan"', 'name = "fan-1"'))
+    with publishing(tmp_path, address, 120, 2.0):
+        done = run("doctor", "--machine", str(other), "--listen", address, "--seconds", "1")
+    assert "nothing arrived under rotorwatch/plant/fan-1/stream; heard were rotorwatch/plant/fan/stream" in done.stdout
+
+
 def test_the_doctor_sums_up_gaps_and_disconnected_sensors(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     machine = load_machine_file(tmp_path / "fan.toml")
