@@ -322,7 +322,10 @@ def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows
     )
     wanted = max((one.windows or 0 for one in blind.values()), default=0)
     if wanted <= windows:
-        advice = "set limits for the levels yourself: the healthy signal of these channels is noise-like"
+        advice = (
+            "rely on the levels, which are compared with the healthy machine, or set limits for them yourself: the "
+            "healthy signal of these channels is noise-like"
+        )
         return told(verdict="limited", text=text, advice=advice)
     advice = (
         f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: with fewer, a window must differ more "

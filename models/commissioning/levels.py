@@ -190,8 +190,8 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         check = _no_equations(why, no_shape, f"sample at {math.ceil(1 / longest_s)} Hz or faster")
     elif all(reason for _, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))):
         advice = (
-            "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in "
-            "that plane"
+            "to diagnose the bearing in one plane, measure displacement, velocity or acceleration in that plane at the "
+            "bearing and at the disc"
         )
         check = _no_equations("these sensors allow no equation", no_shape, advice)
     else:

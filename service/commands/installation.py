@@ -4,6 +4,7 @@ import json
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -55,7 +56,7 @@ def init(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Write a machine file with only sensors, and monitor settings for it; asks for whatever is left out.
+    """Write a machine file with only sensors, and monitor settings for it; asks for names, rate and sensors.
 
     The monitor watches vibration levels at once, and records. Diagnosis is added by [cyan]rotortrain commission[/cyan].
 
@@ -65,8 +66,8 @@ def init(
     [cyan]rotorwatch doctor --machine fan.toml[/cyan]
     [cyan]rotorwatch run --config rotorwatch.toml[/cyan]
     """
-    site = site or _asked("--site", "Site (a group of machines)")
-    name = name or _asked("--name", "Name of the machine")
+    site = site or _asked("--site", "Site (a group of machines)", _name)
+    name = name or _asked("--name", "Name of the machine", _name)
     rate = float(_asked("--rate-hz", "Samples per second and channel", float)) if rate_hz is None else rate_hz
     lines = sensor or _asked_sensors()
     from models.machine import MachineFile  # noqa: PLC0415  # keeps --help quick
@@ -106,7 +107,16 @@ def init(
     typer.echo(f"monitor it:       rotorwatch run --config {quote(str(settings_path))}")
 
 
-def _asked(option: str, text: str, kind: type[str] | type[float] = str, *, empty: bool = False) -> str:
+def _name(text: str) -> str:
+    """Check a name at once, before anything else is asked for."""
+    from models.signals.keys import NAME_PATTERN  # noqa: PLC0415  # keeps --help quick
+
+    if not re.fullmatch(NAME_PATTERN, text):
+        raise typer.BadParameter(f"{text!r} cannot be part of a key: use 1 to 64 letters, digits, '_' or '-'")
+    return text
+
+
+def _asked(option: str, text: str, kind: Callable[[str], object] = str, *, empty: bool = False) -> str:
     if not sys.stdin.isatty():
         raise MachineFileError(f"{option} is missing, and there is no terminal to ask for it")
     return str(typer.prompt(text, type=kind, default="" if empty else None, show_default=False))

@@ -308,7 +308,7 @@ def summary_lines(summary: "OfflineSummary") -> Iterator[str]:
     if summary.skipped_windows:
         yield f"{summary.skipped_windows} windows not evaluated, as in the monitor, which could not keep up"
     if summary.gaps:
-        yield f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing"
+        yield f"gaps: {summary.gaps}, {summary.missing_s:.1f} s missing"
     if summary.first_windows:
         yield summary.first_windows
     if summary.stopped:

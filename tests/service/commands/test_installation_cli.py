@@ -222,13 +222,14 @@ def test_two_sensors_have_a_trend_after_init_run_and_plot(tmp_path: Path) -> Non
 def test_init_prompts_until_an_empty_channel_and_repeats_invalid_entries(tmp_path: Path) -> None:
     keyboard, terminal = os.openpty()
     wrong = "two thousand", "DE-H acceleration g DE", "DE-H acceleration furlong DE horizontal"
-    typed = ("plant", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")
+    typed = ("a plant", "plant", "fan/1", "fan", wrong[0], "2560", *wrong[1:], FAN[10], FAN[12], "")
     os.write(keyboard, "".join(f"{line}\n" for line in typed).encode())
     command = [sys.executable, "-m", "service", "init", "--folder", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, stdin=terminal, capture_output=True, text=True, timeout=60, check=False)
     for end in (keyboard, terminal):
         os.close(end)
     assert done.returncode == 0, done.stderr
+    assert done.stdout.count("cannot be part of a key: use 1 to 64 letters") == 2
     assert "has 4 words, expected 5" in done.stdout
     assert "unit 'furlong' is not one of" in done.stdout
     assert [one.name for one in load_machine_file(tmp_path / "fan.toml").sensors] == ["DE-H", "NDE-V"]
