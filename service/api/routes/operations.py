@@ -140,6 +140,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             expected_state=None if order.expected_state is None else order.expected_state.value,
             expected_version=None if version is None else int(version[0]),
         )
+        _ = _present(view, name)  # the monitor does not know the channels: it would shelve a level that nothing has
         try:
             events = view.operate(operation)
         except (UnknownAlarm, OperationConflict, OperationRefused, NotInTime) as error:
@@ -148,11 +149,11 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
 
 
 def _present(view: Monitored, name: str) -> Alarm:
-    """The current state of an alarm; an alarm that never occurred is normal."""
-    check_alarm(view, name, 404)
+    """The current state of an alarm; an alarm of the machine that never occurred is normal."""
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
             return one
+    check_alarm(view, name, 404)
     (normal,) = alarm_entries((AlarmRecord(name),), include_normal=True)
     return normal
 

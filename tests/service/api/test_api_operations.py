@@ -176,8 +176,10 @@ def test_latched_alarms_are_reset_and_removal_needs_configure(plant: tuple[Runti
         ("data-gap/unshelve", ANY, {}, 409, "data-gap is unacknowledged: unshelve is not possible"),
         ("data-gap/reset", ANY, {}, 409, "data-gap is unacknowledged: reset is not possible"),
         ("k_by/acknowledge", ANY, {}, 409, "k_by is normal: acknowledge is not possible"),
-        ("nose/acknowledge", ANY, {}, 404, "no alarm nose; there are: k_by, c_by"),
-        ("events/acknowledge", ANY, {}, 404, "no alarm events; there are:"),
+        ("level:y9/acknowledge", ANY, {}, 404, "demo/lab: no alarm level:y9; there are: k_by, c_by"),
+        ("level:y9/shelve", ANY, {"reason": "x", "duration_s": 60}, 404, "demo/lab: no alarm level:y9; there are:"),
+        ("nose/acknowledge", ANY, {}, 404, "demo/lab: no alarm nose; there are: k_by, c_by"),
+        ("events/acknowledge", ANY, {}, 404, "demo/lab: no alarm events; there are:"),
     ],
 )  # fmt: skip
 def test_impossible_operations_are_explained(
