@@ -1,5 +1,6 @@
 """Style and output of the pictures; the same data give the same bytes."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, num2date
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -24,7 +25,7 @@ from service.recordings.replay.source import clock
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito's palette, distinguishable with any colour vision."""
-INK, GREY = "#222222", "#777777"
+INK, GREY, SKIPPED = "#222222", "#777777", "#dddddd"
 STATE_COLOURS = {
     "healthy": "#009E73",
     "alert": "#E69F00",
@@ -43,6 +44,8 @@ PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none"
 
 _ROUND = tuple(step * 10.0**power for power in range(-3, 9) for step in (1, 2, 5))
 _MOST_MARKS = 30
+_GAP_WIDTH, _MOST_BEGINS = 0.03, 8
+"""Width of a skipped gap as part of the time shown; largest number of recordings labelled with their beginning."""
 _UNITS = (("days", 86_400), ("hours", 3600), ("minutes", 60), ("s", 1))
 
 _STYLE = {
@@ -193,6 +196,31 @@ def time_axis(axes: Axes, *, vertical: bool = False) -> None:
     axis.set_major_locator(locator)
     axis.set_major_formatter(ConciseDateFormatter(locator, tz="UTC", show_offset=not vertical))  # type: ignore[no-untyped-call]
     axis.set_label_text("time, UTC")
+
+
+def skip_gaps(axes: Axes, end_ns: npt.NDArray[np.int64], longest_ns: int) -> bool:
+    """Narrow the gaps between times that are longer than `longest_ns` to grey bands, if they take most of the axis.
+
+    So recordings of a few minutes that are days apart stay readable; each is labelled with its beginning. Returns
+    whether there are such gaps.
+    """
+    ends = np.flatnonzero(np.diff(end_ns) > longest_ns)
+    if not ends.size or np.diff(end_ns)[ends].sum() < np.ptp(end_ns) / 2:
+        return False
+    first, last = axes.get_xlim()
+    knots = np.concatenate([[first], as_dates(end_ns[np.sort([*ends, *(ends + 1)])]), [last]])
+    widths = np.diff(knots)
+    widths[1::2] = _GAP_WIDTH * widths[::2].sum()
+    places = np.append(0.0, np.cumsum(widths))
+    axes.set_xscale(
+        "function", functions=(lambda t: np.interp(t, knots, places), lambda u: np.interp(u, places, knots))
+    )
+    begins = knots[::2][:: math.ceil(len(knots) / 2 / _MOST_BEGINS)]
+    axes.set_xticks(begins, [f"{num2date(at):%H:%M\n%d %b %Y}" for at in begins])  # type: ignore[no-untyped-call]
+    for panel in axes.get_shared_x_axes().get_siblings(axes):
+        for begin, end in zip(knots[1:-1:2], knots[2:-1:2], strict=True):
+            panel.axvspan(begin, end, color=SKIPPED, linewidth=0)
+    return True
 
 
 def alarm_text(alarm: AlarmEventData) -> str:

@@ -19,6 +19,7 @@ from service.analysis.figures.style import (
     GREY,
     INK,
     SEVERITY_COLOURS,
+    SKIPPED,
     STATE_COLOURS,
     Look,
     alarm_lines,
@@ -26,6 +27,7 @@ from service.analysis.figures.style import (
     as_date,
     as_dates,
     heading,
+    skip_gaps,
     time_axis,
 )
 from service.analysis.past import Past
@@ -59,6 +61,8 @@ def paint_trend(look: Look, trend: TrendSeries) -> Figure:
     step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
     ends = as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns]))
     panels[-1].set_xlim(*ends)
+    time_axis(panels[-1])
+    skipped = skip_gaps(panels[-1], trend.end_ns, round(_GAP * step_ns))
     for axes, parameter in zip(panels[1:], trend.parameters, strict=False):
         _parameter(axes, parameter, trend, step_ns)
     for axes, level in zip(panels[1 + count :], trend.levels, strict=False):
@@ -73,8 +77,7 @@ def paint_trend(look: Look, trend: TrendSeries) -> Figure:
         own = [one for one in trend.alarms if (one.name if one.name in PARAMETER_TEXT else MODEL) == name]
         rows[name] = _name_alarms(axes, own)
     _states(panels[0], trend, step_ns, rows[MODEL])
-    time_axis(panels[-1])
-    figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
+    figure.legend(handles=_legend(trend, skipped=skipped), loc="outside lower center", ncols=5, fontsize=8)
     speed = trend.measures["speed"]
     speeds = speed[np.isfinite(speed)] * 30 / np.pi
     title = f"{trend.name}: changes from nominal" if trend.parameters else f"{trend.name}: vibration levels"
@@ -83,8 +86,8 @@ def paint_trend(look: Look, trend: TrendSeries) -> Figure:
     return figure
 
 
-def _legend(trend: TrendSeries) -> list[Patch | Line2D]:
-    handles: list[Patch | Line2D] = []
+def _legend(trend: TrendSeries, *, skipped: bool) -> list[Patch | Line2D]:
+    handles: list[Patch | Line2D] = [Patch(color=SKIPPED, label="gap, not to scale")] if skipped else []
     if trend.parameters:
         handles.append(Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval"))
     limits = trend.limits if trend.parameters else None
@@ -132,11 +135,11 @@ def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> int:
     Events close to each other are put in different rows, because their texts would overlap.
     """
     letter = _LETTER_IN * axes.figure.dpi / axes.bbox.width
-    first, last = axes.get_xlim()
+    to_fraction = axes.transData + axes.transAxes.inverted()
     taken = [letter * len(axes.get_title(loc="left")) or -1.0]  # end of the text in each row, as a fraction of the axis
     for alarm in sorted(alarms[:8], key=lambda event: event.time_ns):
         text, at = alarm_text(alarm), as_date(alarm.time_ns)
-        half, middle = letter * len(text) / 2, (at - first) / (last - first)
+        half, middle = letter * len(text) / 2, float(to_fraction.transform((at, 0.0))[0])
         row = next((row for row, end in enumerate(taken) if middle - half > end), len(taken))
         taken[row : row + 1] = [middle + half]
         axes.annotate(

@@ -21,7 +21,7 @@ from rotorwatch.records.health import MEASURES, Report
 from rotorwatch.records.levels import LevelLimits
 from service.analysis.correlation import correlations_of, latest_window
 from service.analysis.figures.spectrum import Lines, spectrum, waterfall
-from service.analysis.figures.style import Look, draw
+from service.analysis.figures.style import Look, as_dates, draw
 from service.analysis.figures.trend import paint_trend
 from service.analysis.orbit import read_orbits
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
@@ -318,6 +318,24 @@ def test_names_of_alarms_in_a_trend_do_not_overlap(computed: TrendSeries) -> Non
         for at, box in enumerate(boxes):
             assert not box.count_overlaps(boxes[:at]), texts[at].get_text()
     assert sum(len(axes.texts) for axes in figure.axes) == len(named)
+
+
+def test_recordings_days_apart_fill_the_time_axis_of_a_trend(computed: TrendSeries) -> None:
+    """Formerly each was a line of no width."""
+    half = len(computed.end_ns) // 2
+    later = computed.end_ns + np.where(np.arange(len(computed.end_ns)) < half, 0, 3 * 86_400 * S)
+    figure = paint_trend(Look(), replace(computed, end_ns=later, alarms=()))
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        fraction = (axes.transData + axes.transAxes.inverted()).transform
+        at = fraction(np.column_stack([as_dates(later), np.zeros(len(later))]))[:, 0]
+        assert at[half] - at[half - 1] < 0.05
+        assert np.ptp(at) > 0.9
+        assert np.all(np.diff(np.delete(np.diff(at), half - 1)) < 1e-6)  # equal steps in either recording
+    assert [one.get_text().split("\n")[1] for one in figure.axes[-1].get_xticklabels()] == [
+        "01 Jan 2026",
+        "04 Jan 2026",
+    ]
 
 
 def test_a_trend_without_readings_is_refused_with_a_reason(faulty: Path) -> None:
