@@ -96,7 +96,8 @@ class OfflineResult extends LiveElement {
     this.#facts.textContent = [
       `${lasting(summary.data_s)} of data in ${lasting(summary.elapsed_s)}, ${figure(summary.times_real_time)} times real time`,
       `${summary.blocks} blocks accepted, refused: ${refused || "none"}`,
-      summary.gaps ? `${summary.gaps} gaps, ${figure(summary.missing_s)} s missing` : "no gaps",
+      summary.gaps ? `gaps: ${summary.gaps}, ${figure(summary.missing_s)} s missing` : "no gaps",
+      summary.first_windows,
       `evaluated as ${summary.site}/${summary.machine}, machine file ${summary.machine_hash}, bundle ${summary.bundle ?? "none"}`,
       ...summary.descriptor_differences,
       this.#every > 1 ? `plots show every ${this.#every}th window` : "",
