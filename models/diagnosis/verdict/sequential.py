@@ -340,7 +340,7 @@ class SequentialTest:
     ) -> None:
         """Keep when each changed parameter was first found; forget findings that no longer hold."""
         known = {one.name: one for one in self.state.findings}
-        found = {name: known[name] for name in known if name in changed or self._still_holds(name, clean)}
+        found = {name: known[name] for name in known if name in changed or self._still_holds(known[name], clean)}
         for name in changed:
             if name not in known:
                 by = [every[hops] for hops, verdict in verdicts.items() if name in verdict.changed]
@@ -350,13 +350,18 @@ class SequentialTest:
                 found[name] = finding(name, look.start_ns, look.end_ns, look.duration_s)
         self.state.findings = tuple(found[name] for name in PARAMETERS if name in found)
 
-    def _still_holds(self, name: str, clean: Mapping[int, Stretch]) -> bool:
-        """Whether an earlier finding still holds: there is no whole clean window yet, and the clean data agree."""
+    def _still_holds(self, earlier: Finding, clean: Mapping[int, Stretch]) -> bool:
+        """Whether an earlier finding still holds: there is no whole clean window yet, and the clean data agree.
+
+        What was found while the change came may be an effect of data of both states: clean data have to name it, too.
+        """
         if self.settings.window_hops in clean:
             return False
         if not clean:
             return True
-        at = PARAMETERS.index(name)
+        if earlier.found_ns > (self.state.dated_ns or 0) - min(self.settings.lengths) * self.settings.hop_s * 1e9:
+            return False
+        at = PARAMETERS.index(earlier.name)
         values, variances = _values(clean[max(clean)])
         return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
 

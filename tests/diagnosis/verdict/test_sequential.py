@@ -114,6 +114,15 @@ def test_a_change_that_goes_on_is_read_without_the_data_of_its_course() -> None:
         assert read.relative_change == pytest.approx(-0.18, abs=4 * sure(read.standard_error))
 
 
+@pytest.mark.parametrize("seed", [SEED + 50, pytest.param(SEED + 51, marks=pytest.mark.long)])
+def test_what_only_the_hop_of_a_change_shows_is_forgotten_once_data_since_then_do_not_show_it(seed: int) -> None:
+    """A hop that mixes two machines may read as another parameter; that one was named for a minute beside the right."""
+    story = ((24, true()), (1, true(k_by=-0.05, e=0.6)), (12, true(k_by=-0.1)))
+    names = {n: [one.name for one in v.changed] for n, v in play(SequentialTest(SETTINGS), gaussian(seed), *story)}
+    assert names[24] == ["e"]
+    assert all(names[number] == ["k_by"] for number in range(27, 37))
+
+
 def test_a_small_change_accumulates_over_windows() -> None:
     """Damping 4 % down is no more than three standard errors of a window; sums of windows find it."""
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 2), (24, true()), (160, true(c_by=-0.04)))
