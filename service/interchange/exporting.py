@@ -16,10 +16,12 @@ from models.errors import MachineFileError, RecordingError
 from models.signals.recording import writing
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.interchange.source import Array
+from service.recordings.replay.source import clock
 
 ExportFormat = Literal["parquet", "csv", "mat"]
 ExportSubject = Literal["stream", "reports", "alarms"]
 
+_OTHER_PROGRAMS = {".parquet", ".csv", ".mat", ".xlsx", ".xls"}
 _LARGEST_MATLAB = 2**31 - 1
 _TABLES = {"stream": stream_table, "reports": report_table, "alarms": alarm_table}
 
@@ -36,12 +38,19 @@ def export(
     Raises
     ------
     MachineFileError
-        If the file already exists.
+        If the file already exists or has the ending of another format, or the time that is wanted ends before it
+        begins.
     RecordingError
         If the recordings cannot be read or hold none of the requested data, or the file cannot be written.
     """
+    if out.suffix in _OTHER_PROGRAMS - {f".{kind}"}:  # Excel, for one, refuses a CSV file that is named .xlsx
+        raise MachineFileError(f"{out}: expected a name that ends in .{kind}, as the format is {kind}")
     if out.exists() and not overwrite:
         raise MachineFileError(f"{out}: already exists; --overwrite replaces it")
+    if selection.from_ns is not None and selection.to_ns is not None and selection.from_ns >= selection.to_ns:
+        raise MachineFileError(
+            f"--from is {clock(selection.from_ns)}, not before --to-time {clock(selection.to_ns)} UTC"
+        )
     if any(path.exists() and out.exists() and path.samefile(out) for path in selection.source.paths):
         raise RecordingError(f"{out}: is one of the recordings")
     table = _TABLES[what](selection)
@@ -58,9 +67,11 @@ def export(
         if table.rows == 0:
             names = ", ".join(map(str, selection.source.paths))
             why = f" ({table.skipped[0]})" if table.skipped else ""
-            timed = selection.from_ns is not None or selection.to_ns is not None
-            why = f" in the time that is wanted{why}" if timed else why
-            if what != "stream":
+            if selection.from_ns is not None or selection.to_ns is not None:
+                span = selection.source.span(selection.keys)
+                data = f"the data are of {clock(span.start_ns)} to {clock(span.end_ns)} UTC"
+                why = f" in the time that is wanted; {data}{why}"
+            if what != "stream" and selection.keys.report not in selection.source.keys:
                 why += ": only a monitor records them; rotorwatch replay --offline computes them from the samples"
             raise RecordingError(f"{names}: no {what}{why}")
     return table

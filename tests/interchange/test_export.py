@@ -209,9 +209,16 @@ def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
 def test_missing_data_and_unusable_output_files_are_named(tmp_path: Path) -> None:
     recording(tmp_path / "run.mcap", blocks=2)
     selection = selected(tmp_path / "run.mcap", from_ns=START_NS + 10**12)
-    with pytest.raises(RecordingError, match="no stream in the time that is wanted"):
-        export(selection, "stream", "parquet", tmp_path / "out.parquet")
+    spanned = r" in the time that is wanted; the data are of 2026-01-31 12:00:00\.0 to 2026-01-31 12:00:00\.2 UTC$"
+    for what in ("stream", "alarms"):  # alarms without a hint at a replay: a monitor has recorded them
+        with pytest.raises(RecordingError, match=what + spanned):
+            export(selection, what, "parquet", tmp_path / "out.parquet")
+    reversed_ = selected(tmp_path / "run.mcap", from_ns=START_NS + 10**8, to_ns=START_NS)
+    with pytest.raises(MachineFileError, match=r"--from is 2026-.*\.1, not before --to-time 2026-.*\.0 UTC"):
+        export(reversed_, "stream", "parquet", tmp_path / "out.parquet")
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    with pytest.raises(MachineFileError, match=r"out\.xlsx: expected a name that ends in \.csv"):
+        export(selected(tmp_path / "run.mcap"), "stream", "csv", tmp_path / "out.xlsx")
     with pytest.raises(MachineFileError, match=r"run\.mcap: already exists; --overwrite replaces it"):
         export(selected(tmp_path / "run.mcap"), "stream", "parquet", tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=r"run\.mcap: is one of the recordings"):
