@@ -283,6 +283,8 @@ def reading(path: Path) -> Iterator[None]:
     """Turn trouble in reading a file, damage included, into a `RecordingError` that names it."""
     try:
         yield
+    except IsADirectoryError as error:
+        raise RecordingError(f"{path}: is a folder, expected a recording (.mcap) in it") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror or error})") from error
     except DAMAGE as error:

@@ -119,6 +119,8 @@ def test_unreadable_and_unwritable_paths_are_named(tmp_path: Path) -> None:
     for read in (lambda path: list(read_recording(path)), summarize_recording):
         with pytest.raises(RecordingError, match=r"none\.mcap: cannot be read \(No such file"):
             read(tmp_path / "none.mcap")
+        with pytest.raises(RecordingError, match=r"is a folder, expected a recording \(\.mcap\) in it"):
+            read(tmp_path)
     with pytest.raises(RecordingError, match=r"none/run\.mcap\.part: cannot be written"):
         RecordingWriter(tmp_path / "none" / "run.mcap")
     with pytest.raises(RecordingError, match="is a folder, expected the name of a recording"):
