@@ -25,6 +25,9 @@ from service.monitor.levels import LevelWatch
 _MOST_BREAKS = 3
 """Most breaks in the stream that are reported individually."""
 
+_LARGEST_ZONE_H, _CLOSE_TO_ZONE_S = 14, 60.0
+"""A clock that differs by a quarter of an hour or a multiple, up to this and within this, may show local time."""
+
 
 def examined(
     machine: MachineFile, messages: Sequence[RecordedMessage], others: Collection[str] = ()
@@ -84,7 +87,11 @@ def examined(
         ahead_s = (accepted[-1].end_ns - stream[-1].log_time_ns) / 1e9
         clocks = "ahead of" if ahead_s > 0 else "behind"
         newest = rfc3339(accepted[-1].end_ns)
-        lines.append(f"newest sample of {newest}, {three_digits(abs(ahead_s))} s {clocks} this computer's clock")
+        # Not a trouble: simulators and replays may be anywhere in time.
+        hours = round(ahead_s / 900) / 4
+        local = 0 < abs(hours) <= _LARGEST_ZONE_H and abs(ahead_s - 3600 * hours) < _CLOSE_TO_ZONE_S
+        zone = f": perhaps local time (by {abs(hours):g} h), expected UTC" if local else ""
+        lines.append(f"newest sample of {newest}, {three_digits(abs(ahead_s))} s {clocks} this computer's clock{zone}")
         lines += _of_samples(machine, accepted, troubles)
     return lines, troubles
 
