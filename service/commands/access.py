@@ -167,12 +167,16 @@ def audit(
 
     [cyan]rotorwatch audit --machine plant/pump-7 --limit 20[/cyan]
     """
+    if machine is not None and machine.count("/") != 1:
+        raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab")
     with _opened(config) as store:
         entries = list(islice(_with_outcomes(store, machine, actor), limit))
     who = max((len(entry.actor) for entry in entries), default=0)
     origin = max((len(entry.address) for entry in entries), default=0)
     for entry in entries:
         typer.echo(_audit_line(entry, who, origin))
+    if not entries:
+        typer.echo("no entries", err=True)
 
 
 def _with_outcomes(store: "Store", machine: str | None, actor: str | None) -> "Iterator[AuditRecord]":

@@ -129,6 +129,10 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, config: str) -> No
         chosen = run("audit", "--machine", "demo/lab", "--config", config).stdout
         assert "k_by" in chosen
         assert "DELETE" not in chosen
+        assert run("audit", "--machine", "demo/lba", "--config", config).stderr == "no entries\n"
+        refused = run("audit", "--machine", "lab", "--config", config)
+        assert refused.exit_code == 2
+        assert "--machine is 'lab', expected SITE/MACHINE" in refused.stderr
         assert "DELETE" not in run("audit", "--limit", "2", "--config", config).stdout
         assert "GET /health" not in run("audit", "--actor", "control room", "--config", config).stdout
 
