@@ -20,8 +20,8 @@ class DataQuality extends MachineElement {
     /** @type {[string, string | false][]} */
     const facts = [
       ["newest data", age === null ? "none since the monitor started" : `${lasting(age)} old`],
-      ["silent", stream.silent && `since ${clock(stream.silent_since_ns)}`],
-      ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
+      ["silent", stream.silent && stream.silent_since_ns !== null && `since ${clock(stream.silent_since_ns)}`],
+      ["window", `${(100 * health.filled).toFixed(0)} % full${report ? `, until ${clock(report.end_ns)}` : ""}`],
       ["speed", speed !== null && `${figure(Math.round((speed * 300) / Math.PI) / 10)} rpm`],
       ["misfit", typeof report?.misfit_z === "number" && `${figure(report.misfit_z)} standard deviations`],
       ["gyroscopic moments", report?.gyroscopic === "opposite" && "the opposite sense to Eq. (27): it explains this machine"],

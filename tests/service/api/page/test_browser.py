@@ -254,6 +254,12 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
         tell_instead(page, told)
         page.goto(f"{url}/#/")
         expect(page.locator("machine-tile .worst")).to_have_text("<b>reason</b> & more")  # not one of its levels
+    told |= {"report": None, "filled": 0.0, "stream": told["stream"] | {"silent": True, "silent_since_ns": None}}
+    with looking(browser, url) as page:
+        tell_instead(page, told)
+        page.goto(f"{url}/#/machines/demo/lab")
+        expect(page.locator("data-quality")).to_contain_text("window0 % fullblocks")  # no time that is not known
+        expect(page.locator("data-quality")).not_to_contain_text("silent")
 
 
 def test_a_view_that_loads_late_does_not_replace_a_newer_one(browser: Browser, plant: Plant) -> None:
