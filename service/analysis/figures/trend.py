@@ -36,7 +36,7 @@ from service.analysis.trend import LevelTrend, ParameterTrend, TrendSeries, past
 
 _GAP = 2.5
 _DASHES = (0, (4, 3))
-_LEAST_PERCENT = 5.0
+_LEAST_PERCENT, _HEADROOM = 5.0, 1.6
 _LETTER_IN, _ROW_PT = 0.065, 11.0
 """Width of a letter in small print, in inches, and its line spacing, in points."""
 
@@ -92,8 +92,8 @@ def _legend(trend: TrendSeries, *, skipped: bool) -> list[Patch | Line2D]:
         handles.append(Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval"))
     limits = trend.limits if trend.parameters else None
     drawn = {
-        "alert": limits is not None or any(np.isfinite(level.alert).any() for level in trend.levels),
-        "danger": any(np.isfinite(level.danger).any() for level in trend.levels)
+        "alert": limits is not None or any(_is_near(level, level.alert) for level in trend.levels),
+        "danger": any(_is_near(level, level.danger) for level in trend.levels)
         or (limits is not None and any(_danger_near(parameter, limits) for parameter in trend.parameters)),
     }
     for severity in (one for one, shown in drawn.items() if shown):
@@ -194,8 +194,13 @@ def _level(axes: Axes, level: LevelTrend, trend: TrendSeries, step_ns: int) -> N
     axes.set_title(level.title)
     known = values[np.isfinite(values)]
     if known.size:
-        axes.set_ylim(0, 1.6 * float(known.max()) or 1.0)
+        axes.set_ylim(0, _HEADROOM * float(known.max()) or 1.0)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+
+
+def _is_near(level: LevelTrend, limit: npt.NDArray[np.float64]) -> bool:
+    """Whether a limit is drawn inside the axis of `_level`."""
+    return bool(np.any(limit < _HEADROOM * np.max(level.level, initial=0.0, where=np.isfinite(level.level))))
 
 
 def _measure(axes: Axes, name: str, trend: TrendSeries, step_ns: int) -> None:

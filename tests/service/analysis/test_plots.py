@@ -270,7 +270,8 @@ def test_a_trend_shows_levels_beyond_their_limits_beside_the_overall_one(lines: 
     )
     assert [one.title for one in found.levels[:3]] == ["y1   overall, µm pp", "y1   2x, µm pp", "y2   overall, µm pp"]
     assert (found.levels[1].level[-1], found.levels[1].alert[-1]) == (4.0, 3.5)
-    for levels, limits in ((found.levels[1:2], ["alert limit"]), (found.levels[:1], [])):
+    far = (replace(found.levels[1], alert=10 * found.levels[1].alert),)  # outside the axis
+    for levels, limits in ((found.levels[1:2], ["alert limit"]), (found.levels[:1], []), (far, [])):
         figure = paint_trend(Look(), replace(found, levels=levels, parameters=(), limits=LAB.alarms, alarms=()))
         assert [one.get_text() for legend in figure.legends for one in legend.get_texts()] == limits
         assert 3 <= sum(0 <= tick <= figure.axes[1].get_ylim()[1] for tick in figure.axes[1].get_yticks()) <= 5
