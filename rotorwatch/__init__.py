@@ -26,7 +26,7 @@ from rotorwatch.records.alarms import (
     Severity,
 )
 from rotorwatch.records.health import Health, HealthState, Quality, Report, StreamStatus
-from rotorwatch.records.history import AuditRecord, Reading, ReadingBucket
+from rotorwatch.records.history import AlarmEvidence, AuditRecord, Reading, ReadingBucket
 from rotorwatch.records.machines import (
     Channel,
     DetectableChanges,
@@ -49,6 +49,7 @@ __all__ = [
     "Alarm",
     "AlarmCloudEvent",
     "AlarmEventData",
+    "AlarmEvidence",
     "AlarmState",
     "AlarmStates",
     "AuditRecord",

@@ -17,7 +17,9 @@ _KINDS: dict[int, type[RequestRefused]] = {
     409: Conflict,
     412: Conflict,
     429: Unavailable,
+    502: Unavailable,  # a proxy's answer while the service restarts, like 504
     503: Unavailable,
+    504: Unavailable,
 }
 _SHOWN = 200
 
@@ -38,6 +40,8 @@ def understood(model: type[M], text: str | bytes, place: str) -> M:
         return model.model_validate_json(text)
     except ValidationError as error:
         fault = error.errors()[0]
+        if fault["type"] == "json_invalid":
+            raise ClientError(f"{place}: the answer is not JSON; is this the address of a monitor?") from error
         field = ".".join(str(part) for part in fault["loc"])
         raise ClientError(
             f"{place}: the data received do not match this version; do versions differ? {field}: {fault['msg']}"

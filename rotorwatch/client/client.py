@@ -17,6 +17,7 @@ from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState, AlarmS
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.history import (
     AlarmEventList,
+    AlarmEvidence,
     AuditList,
     AuditRecord,
     Reading,
@@ -134,6 +135,10 @@ class Client:
         """The current state of one alarm."""
         return self._get(Alarm, place, f"alarms/{name}")
 
+    def evidence(self, place: str, name: str, occurrence: int | None = None) -> AlarmEvidence:
+        """Report, spectra, orbits and correlations before an alarm, with it and after; of its latest occurrence."""
+        return self._get(AlarmEvidence, place, f"alarms/{name}/evidence", occurrence=occurrence)
+
     def acknowledge(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
         """Acknowledge an alarm: state that it has been seen."""
         return self._operate(place, seen, "acknowledge", reason=reason)
@@ -202,7 +207,7 @@ class Client:
     def readings(
         self, place: str, quantity: str, name: str = "", *, since_ns: int | None = None, until_ns: int | None = None
     ) -> Iterator[Reading]:
-        """Every reading of a parameter, equation, misfit or speed, oldest first, fetched page by page."""
+        """Every reading of a parameter, equation, level, misfit or speed, oldest first, fetched page by page."""
         wanted: dict[str, _Parameter] = {"quantity": quantity, "name": name or None}
         path = _path(place, "readings")
         for page in self._pages(ReadingList, path, "after", None, since_ns=since_ns, until_ns=until_ns, **wanted):

@@ -46,4 +46,4 @@ class Conflict(RequestRefused):
 
 
 class Unavailable(RequestRefused):
-    """There were too many requests, or the service could not answer in time: try again later."""
+    """There were too many requests, or the service (a proxy: 502, 504) could not answer in time: try again later."""

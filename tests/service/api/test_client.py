@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import httpx
 import pytest
 import trustme
 
@@ -86,6 +87,11 @@ def test_alarms_and_their_log_are_read(plant: Client, seen: tuple[Runtime, Machi
     assert everything == worker.alarms(include_normal=True)
     raised = plant.alarm(PLACE, "k_by")
     assert raised in everything.alarms
+    evidence = plant.evidence(PLACE, "k_by")
+    assert (evidence.name, evidence.occurrence) == ("k_by", raised.occurrence)
+    assert plant.evidence(PLACE, "k_by", 1) == evidence
+    with pytest.raises(NotFound):
+        plant.evidence(PLACE, "k_by", 99)
     assert plant.alarms(PLACE, states=[raised.state], names=["k_by", "e"]).alarms == (raised,)
     assert plant.alarm(PLACE, "level:y1_dot").name == "level:y1_dot"
     assert plant.alarms(PLACE, names=["e"]).alarms == tuple(one for one in everything.alarms if one.name == "e")
@@ -191,6 +197,24 @@ def test_an_unreachable_service_or_invalid_url_is_named() -> None:
             plant.machines()
         with pytest.raises(NoAnswer, match=url):
             next(plant.events())
+
+
+def test_events_wait_for_a_service_that_restarts_behind_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = [httpx.Response(status) for status in (502, 503, 504)] + [httpx.Response(401)]
+    monkeypatch.setattr("rotorwatch.client.event_stream._FIRST_PAUSE_S", 0.0)
+    with Client("http://plant", "rw_x") as plant:
+        plant._http = httpx.Client(base_url="http://plant", transport=httpx.MockTransport(lambda _: answers.pop(0)))
+        with pytest.raises(AccessRefused):
+            next(plant.events())
+    assert not answers
+
+
+def test_an_address_that_answers_with_pages_is_named() -> None:
+    with Client("http://plant", "rw_x") as plant:
+        page = httpx.MockTransport(lambda _: httpx.Response(200, text="<html>Sign in</html>"))
+        plant._http = httpx.Client(base_url="http://plant", transport=page)
+        with pytest.raises(ClientError, match="not JSON; is this the address of a monitor"):
+            plant.machines()
 
 
 @contextmanager
