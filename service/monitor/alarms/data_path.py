@@ -65,6 +65,7 @@ class DataPathAlarms:
         overloaded = dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
             self._raise_silence(before_ns)
+        refused = self._refused if before_ns <= self._refused_ns < start_ns else ""
         self._refused = ""
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if overloaded:
@@ -74,22 +75,23 @@ class DataPathAlarms:
             book.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
         if verdict.clock_step_s and not verdict.new_run:
             book.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
-        torn = self._frequent_gaps(verdict, start_ns)
+        torn = self._frequent_gaps(verdict, start_ns, refused)
         if torn:
             book.update_state(GAP, True, start_ns, torn, at_once=True)
         book.suppress(None, start_ns)
         return torn
 
-    def _frequent_gaps(self, verdict: Admission, start_ns: int) -> str:
+    def _frequent_gaps(self, verdict: Admission, start_ns: int, refused: str) -> str:
         """Sentence saying that gaps, each too short for an alarm, are so frequent that no hop is whole; else empty."""
         if self._whole_ns is None or verdict.clock_step_s or verdict.gap_s >= self._gap_s:
             self._whole_ns = start_ns
         without_ns = start_ns - self._whole_ns
         if verdict.continuous or without_ns < _MOST_HOPS * self._hop_ns:
             return ""
+        lost = f"are lost, or their times do not come from counting samples; the latest: {verdict.text}"
         return (
             f"no {self._hop_ns / 1e9:g} s without a gap for {without_ns / 1e9:.3g} s, so nothing is evaluated: blocks "
-            f"are lost, or their times do not come from counting samples; the latest: {verdict.text}"
+            f"{f'are refused, the latest: {refused}' if refused else lost}"
         )
 
     def passed(self, time_ns: int, end_ns: int | None) -> None:
