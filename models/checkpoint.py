@@ -118,7 +118,7 @@ def checked(
     """
     array = arrays.get(name)
     if array is None:
-        raise CheckpointError(f"{name} is missing; there are {', '.join(sorted(arrays)) or 'no arrays at all'}")
+        raise CheckpointError(f"{name} is missing")
     sizes = zip(shape, array.shape, strict=True)
     fits = len(array.shape) == len(shape) and all(size in (None, found) for size, found in sizes)
     if not fits or array.dtype.type is not kind:

@@ -181,7 +181,7 @@ def restored(
         try:
             monitor.restore(head.state, tuple(data for _, data in checkpoint.parts), report)
         except CheckpointError as error:
-            monitor, differs = build(), [str(error)]
+            monitor, differs = build(), [f"what is remembered does not fit this state of the program ({error})"]
     try:
         monitor.restore_alarms(head.alarms, next_sequence, head.end_ns or None)
     except CheckpointError as error:

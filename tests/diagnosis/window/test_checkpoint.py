@@ -187,7 +187,7 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing() -> None:
     arrays = remembered()
     window = unprefixed("window", arrays)
     empty = SlidingWindow(plan_for(WITHOUT_ANGLE, lagged=False))
-    with pytest.raises(CheckpointError, match=r"times_ns is missing; there are no arrays at all"):
+    with pytest.raises(CheckpointError, match=r"^times_ns is missing$"):
         empty.restore({name: array for name, array in window.items() if not name.startswith("hop_3/")})
     with pytest.raises(CheckpointError, match="other channels or settings"):
         SlidingWindow(plan_for(WITHOUT_ANGLE, lagged=True)).restore(window)
@@ -357,7 +357,7 @@ def test_prefixes_separate_the_parts_of_a_state() -> None:
     parts = prefixed("a", {"x": np.array(1)}) | prefixed("ab", {"x": np.array(2)})
     assert unprefixed("a", parts) == {"x": np.array(1)}
     assert unprefixed("b", parts) == {}
-    with pytest.raises(CheckpointError, match="x is missing; there are a/x, ab/x"):
+    with pytest.raises(CheckpointError, match=r"^x is missing$"):
         checked(parts, "x", np.int64, ())
 
 

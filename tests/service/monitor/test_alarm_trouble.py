@@ -305,6 +305,18 @@ def test_alarms_keep_their_data_time_under_another_machine_file(later_ns: int, e
     assert sure(shelf).until_ns == end_ns + 3600 * S + moved_ns
 
 
+def test_what_another_state_of_the_program_remembered_is_called_that() -> None:
+    installed = install(machine(), None)
+    before = MachineMonitor(installed)
+    before.step(block(0))
+    step = checkpoint_step(identity_of(installed), before.state(), 1)
+    arrays = dict(from_bytes(step.head.state))
+    del arrays["data_path/unseen"]
+    then = Checkpoint(replace(step.head, state=to_bytes(arrays)), step.new_parts)
+    _, text = restored(lambda: MachineMonitor(installed), identity_of(installed), then, 1)
+    assert "anew: what is remembered does not fit this state of the program (unseen is missing)" in text
+
+
 def test_a_lost_stream_is_noticed_after_the_machine_file_has_changed() -> None:
     monitor = MachineMonitor(install(machine(), None))
     monitor.restore_alarms(AlarmBook(AlarmSettings()).checkpoint(), 0, START_NS)
