@@ -44,7 +44,7 @@ _UNREADABLE = (
     (r"Cannot overwrite a value", "this name occurs twice"),
     (r"Cannot declare \('(?P<name>.*)',\) twice", "the table {name} occurs twice"),
     (r"Expected newline or end of document after a statement", "expected the end of the line after the value"),
-    (r"Unescaped '\\\\' in a string", "a backslash in text: write / instead, or put the text in single quotes"),
+    (r"Unescaped '\\' in a string", "a backslash in text: write / instead, or put the text in single quotes"),
 )
 
 

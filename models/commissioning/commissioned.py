@@ -303,6 +303,13 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     except OSError as error:
         raise BundleError(f"{path}: not a commissioned bundle: {error.strerror}") from error
     except ValidationError as error:
+        # A program has written it: where a field might belong instead is of no use, nor is the same of every channel.
+        unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
+        if unknown:
+            raise BundleError(
+                f"{path}: of another version of the program, which knew {'.'.join(map(str, unknown[0]))}: use the "
+                "version that commissioned the machine, or a newer one, or commission it again"
+            ) from error
         told = "; ".join(text for _, text in mistakes(error, Commissioned))
         raise BundleError(f"{path}: damaged, or of another version: {told}") from error
     if (found.site, found.machine) != (machine.site, machine.name):
@@ -384,9 +391,10 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     if (directory / "report.json").is_file() and not (directory / MANIFEST).is_file():
         raise BundleError(f"{directory}: this commissioning was refused; {directory / 'report.html'} says why")
     if not isinstance(machine, Machine):
+        what = "is not a commissioned bundle" if directory.is_dir() else "is no folder, expected a commissioned bundle"
         raise BundleError(
-            f"{machine.title}: {directory} is not a commissioned bundle, and its machine file does not "
-            "give all parameters of the rotor, which a trained one needs; commission it from healthy recordings "
-            "(rotortrain commission), or name no bundle: then its vibration levels are watched"
+            f"{machine.title}: {directory} {what}; its machine file does not give all parameters of the rotor, which a "
+            "trained one needs; commission it from healthy recordings (rotortrain commission), or name no bundle: then "
+            "its vibration levels are watched"
         )
     return Installed(machine, load_bundle(directory, machine))

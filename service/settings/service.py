@@ -15,7 +15,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
-from models.mistakes import in_folder, mistakes, read_toml, unseen_mistakes
+from models.mistakes import did_you_mean, in_folder, mistakes, read_toml, unseen_mistakes
 from models.signals.link import LinkSettings, TlsSettings, endpoint_fault, is_address
 from service.history.records import Retention, StoreError
 from service.settings.access import AccessSettings, check_access
@@ -303,6 +303,13 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         if table in fields:
             raise MachineFileError(f"{path}: is a {kind}, expected settings")
     place = Path("default settings") if path is None else path
+    # Others may belong to other programs: Kubernetes makes ROTORWATCH_PORT for a service of that name.
+    for name in sorted(os.environ):
+        table, nested, _ = name.removeprefix(_ENV_PREFIX).lower().partition("__")
+        if name.startswith(_ENV_PREFIX) and nested and table not in ServiceSettings.model_fields:
+            raise MachineFileError(
+                f"environment variable {name}: {table}: unknown{did_you_mean(table, ServiceSettings.model_fields)}"
+            )
     told = [f"{place}: {text}" for text in unseen_mistakes(fields, ServiceSettings)]
     try:
         settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point

@@ -382,10 +382,16 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
     rolled["sensors"] += others
     with pytest.raises(BundleError, match="sensors"):
         load_commissioned(tmp_path, MachineFile.model_validate(rolled))
-    with pytest.raises(BundleError, match=r"is not a commissioned bundle.*or name no bundle"):
+    with pytest.raises(BundleError, match=r"nowhere is no folder, expected a commissioned bundle.*or name no bundle"):
         install(NOTHING, tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BundleError, match="is not a commissioned bundle"):
+        install(NOTHING, tmp_path / "empty")
     assert install(NOTHING, None).watching
     fields = json.loads(made.model_dump_json())
+    path.write_text(json.dumps(fields | {"share": 1, "states": 2}))
+    with pytest.raises(BundleError, match=r"of another version of the program, which knew share: use .* again$"):
+        load_commissioned(tmp_path, NOTHING)
     fields["baselines"][0]["baseline"]["covariance"][0][0] = "NaN"
     path.write_text(json.dumps(fields))
     with pytest.raises(BundleError, match=r"baselines\.0\.baseline\.covariance"):
