@@ -5,6 +5,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from models.arrivals import Senders
 from models.commissioning.commissioned import Installed
 from models.diagnosis.sensors.missing import MissingNumbers
 from models.diagnosis.window.moments import plan_for
@@ -50,7 +51,7 @@ def examined(
         keys_heard = sorted({*others, *(one.key for one in messages)})
         heard = f"; heard were {', '.join(keys_heard)}" if keys_heard else ""
         return [f"{place}: no sample blocks"], [f"nothing arrived under {keys.stream}{heard}", *troubles]
-    gate, missing = Gate(machine, partial=True), MissingNumbers(machine.sensors)
+    gate, missing, senders = Gate(machine, partial=True), MissingNumbers(machine.sensors), Senders()
     refused, rates = defaultdict[str, list[str]](list), set[float]()
     accepted: list[SampleBlock] = []
     breaks: list[Admission] = []
@@ -61,6 +62,7 @@ def examined(
             refused["malformed"].append(f"it cannot be decoded: {error}")
             continue
         rates.add(block.rate_hz)
+        senders.take(block)
         verdict = gate.judge(block)
         if not verdict.accepted:
             refused[str(verdict.reason)].append(verdict.text)
@@ -70,13 +72,9 @@ def examined(
         if not verdict.continuous or verdict.new_snapshot:
             accepted.clear()
         accepted.append(missing.take(block))
-    if len(breaks) > _MOST_BREAKS:
-        missing_s = sum(one.gap_s for one in breaks)
-        troubles.append(
-            f"{len(breaks)} times a block does not follow the previous one; {missing_s:.3g} s of data are missing, "
-            "for example:"
-        )
-    troubles += [one.text for one in breaks[:_MOST_BREAKS]]
+    if senders.conflict:
+        troubles.append(f"two publishers contradict each other: {senders.conflict}")
+    troubles += _of_breaks(breaks)
     troubles += [f"{len(texts)} blocks would be refused, for example: {texts[0]}" for texts in refused.values()]
     lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(map(len, refused.values()))} of them usable"]
     if rates:
@@ -96,12 +94,32 @@ def examined(
     return lines, troubles
 
 
+def _of_breaks(breaks: Sequence[Admission]) -> list[str]:
+    """Describe where a block does not follow the previous one: all in one sentence, then the first ones."""
+    told = [one.text for one in breaks[:_MOST_BREAKS]]
+    if len(breaks) <= _MOST_BREAKS:
+        return told
+    missing_s = sum(one.gap_s for one in breaks)
+    many = f"{len(breaks)} times a block does not follow the previous one; {missing_s:.3g} s of data are missing"
+    return [f"{many}, for example:", *told]
+
+
 def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: list[str]) -> list[str]:
     """Describe duration, speed and levels of consecutive blocks; append what is wrong with them to `troubles`."""
     plan = plan_for(machine, levels=True)
     samples = plan.to_si(np.concatenate([block.samples for block in blocks]))
     duration_s = (blocks[-1].end_ns - blocks[0].start_ns) / 1e9
     what = "without a gap" if machine.schedule is None else "in the latest snapshot"
+    # Blocks may each begin within the tolerance and still drift away from the rate, the shorter the further.
+    first_to_last_s = (blocks[-1].start_ns - blocks[0].start_ns) / 1e9
+    counted = sum(len(block.samples) for block in blocks[:-1])
+    off_s = first_to_last_s - counted / machine.rate_hz
+    if abs(off_s) > 2 * machine.ingest.time_tolerance_s + machine.ingest.rate_tolerance * first_to_last_s:
+        troubles.append(
+            f"by their time stamps, {counted / first_to_last_s:.6g} samples come in a second, expected "
+            f"{machine.rate_hz:g}: speed and frequencies are wrong by {off_s / first_to_last_s:.2%}, or start_ns does "
+            "not come from counting samples"
+        )
     lines = [f"{duration_s:.3g} s {what}, in blocks of {np.median([len(one.samples) for one in blocks]):g} samples"]
     speed, angle = np.nan, None
     if plan.angle_column is None:

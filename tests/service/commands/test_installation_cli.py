@@ -168,6 +168,11 @@ def test_the_doctor_sums_up_gaps_and_disconnected_sensors(tmp_path: Path) -> Non
     told = troubles(blocks(12.0, every_s=0.6))
     assert "19 times a block does not follow the previous one; 1.9 s of data are missing, for example:" in told
     assert sum("0.1 s" in one for one in told) == 3
+    fast = [(replace(one, start_ns=one.start_ns - 150_000 * one.sequence), ()) for one, _ in blocks(12.0)]
+    by_time = "by their time stamps, 2560.77 samples come in a second, expected 2560: speed and frequencies are wrong"
+    assert [one for one in troubles(iter(fast)) if by_time in one]
+    both = [(each, ()) for block, _ in blocks(12.0) for each in (block, replace(block, run=4))]
+    assert "two publishers contradict each other: runs 3 and 4 both send" in troubles(iter(both))
     whole = list(blocks(6.0))
     for block, _ in whole[4:7]:
         block.samples[:, 1] = np.nan
