@@ -101,6 +101,7 @@ class MachineMonitor:
         except WireError as error:
             return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self.machine.title}: {error}"))),)
         if (misshapen := self._gate.form(block)) is not None:  # before its run and number are used
+            self._data_path.judged(misshapen, block.start_ns)
             return (MonitorReport(self._count(misshapen)),)
         if self._window.lacks or self._gate.had(block):  # `had`: sent again after a restart, neither new nor a mistake
             if self._gate.knows(block):

@@ -65,7 +65,9 @@ class DataPathAlarms:
         overloaded = dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
             self._raise_silence(before_ns)
-        refused = self._refused if before_ns <= self._refused_ns < start_ns else ""
+        # Blocks wait for a refused one as for one that comes late; meanwhile others after it are refused.
+        until_ns = start_ns + _MOST_HOPS * self._hop_ns
+        refused = self._refused if before_ns <= self._refused_ns < until_ns else ""
         self._refused = ""
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if overloaded:
@@ -91,7 +93,7 @@ class DataPathAlarms:
         lost = f"are lost, or their times do not come from counting samples; the latest: {verdict.text}"
         return (
             f"no {self._hop_ns / 1e9:g} s without a gap for {without_ns / 1e9:.3g} s, so nothing is evaluated: blocks "
-            f"{f'are refused, the latest: {refused}' if refused else lost}"
+            f"{f'are refused, for example: {refused}' if refused else lost}"
         )
 
     def passed(self, time_ns: int, end_ns: int | None) -> None:

@@ -331,7 +331,8 @@ def test_stream_lost_names_why_blocks_were_refused() -> None:
     for number in range(4):
         one = block(number)
         one.samples[10, 2] = np.nan if number else 0.0
-        assert monitor.step(one).verdict.accepted is (number == 0)
+        (report,) = monitor.step_payload(*encode_block(one, ""))
+        assert report.verdict.accepted is (number == 0)
     for each in (monitor, resumed(monitor, install(machine(), None))):
         (event,) = each.passed(block(0).end_ns + 5 * S)
         assert event.alarm.name == STREAM_LOST

@@ -165,14 +165,26 @@ def test_a_publisher_restarted_while_the_monitor_was_down_is_no_stepped_clock() 
         assert [event.alarm.name for event in events if event.kind == "raised"] == told
 
 
-@pytest.mark.parametrize("torn", ["times that are not counted in samples", "lost blocks", "refused blocks"])
+def test_refused_blocks_are_named_while_they_leave_no_hop_complete() -> None:
+    """As they arrive live, where those after a refused one wait for it."""
+    target = watching()
+    sent = [
+        one if at % 7 else replace(one, samples=one.samples * np.nan) for at, one in enumerate(healthy(100.0)[650:])
+    ]
+    events = [
+        event for one in sent for report in target.step_payload(*encode_block(one, "")) for event in report.events
+    ]
+    assert named(events) == [("raised", "data-gap")]
+    assert "nothing is evaluated: blocks are refused, for example: demo/lab: block" in events[0].alarm.note
+    assert "blocks are refused, for example: demo/lab: block" in target.health().reason
+
+
+@pytest.mark.parametrize("torn", ["times that are not counted in samples", "lost blocks"])
 def test_the_state_is_not_evaluable_while_no_hop_is_complete(torn: str) -> None:
     target, after = watching(), healthy(170.0)[650:]
     spoilt = after[:400]
     if torn == "lost blocks":
         spoilt = [block for number, block in enumerate(spoilt) if number % 20]
-    elif torn == "refused blocks":
-        spoilt = [replace(one, samples=one.samples * (1.0 if at % 20 else np.nan)) for at, one in enumerate(spoilt)]
     else:
         spoilt = [replace(block, start_ns=block.start_ns + 10**6 * (number % 3)) for number, block in enumerate(spoilt)]
     windows, events = feed(target, spoilt)
@@ -180,8 +192,7 @@ def test_the_state_is_not_evaluable_while_no_hop_is_complete(torn: str) -> None:
     assert named(events) == [("raised", "data-gap")]
     assert "no 5 s without a gap for 2" in events[0].alarm.note
     assert target.health().state is HealthState.NOT_EVALUABLE
-    why = "refused, the latest: demo/lab: block" if torn == "refused blocks" else "lost, or their times"
-    assert f"nothing is evaluated: blocks are {why}" in target.health().reason
+    assert "nothing is evaluated: blocks are lost, or their times" in target.health().reason
     stopped = watching()  # a restart meanwhile causes no delay
     feed(stopped, spoilt[:100])
     assert feed(resumed(stopped, KIT), spoilt[100:])[1] == events
