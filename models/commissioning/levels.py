@@ -238,7 +238,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
             stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
-        compared += _read_across_halves(group, baseline.rows)
+        compared += _read_across_halves(group, baseline.rows, machine.window_data_s)
     halves = check_agreement(machine, [each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     names = dict.fromkeys(piece.recording for piece in pieces)
@@ -313,8 +313,8 @@ def _by_speed(pieces: Sequence[HealthyPiece]) -> list[list[HealthyPiece]]:
     return groups
 
 
-def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> tuple[Read, ...]:
-    """Every window, read against a baseline learned on the other halves of the recordings."""
+def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row], length_s: float) -> tuple[Read, ...]:
+    """Every window, read against a baseline learned on the other halves of the recordings, as far as it determines."""
     found: list[Read] = []
     for late in (False, True):
         teaching = [piece for piece in pieces if piece.late is not late]
@@ -326,7 +326,10 @@ def _read_across_halves(pieces: Sequence[HealthyPiece], rows: Sequence[Row]) -> 
         except EstimationError:
             continue  # half of the data is not enough for this machine, but all may be
         diagnostician = BaselineDiagnostician(half.without_force)
-        found += [(p.recording, p.window.end_ns, diagnostician.diagnose(p.window)) for p in asked]
+        for p in asked:
+            found.append(
+                (p.recording, p.window.end_ns, determined(diagnostician.diagnose(p.window), p.window, length_s))
+            )
     return tuple(sorted(found, key=lambda read: read[1]))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from models.levels.bands import ERRORS, Growth, band_in_words, growth
 from models.levels.contact import LatestContact
-from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_beats, fallen_by_lines, without_lines
+from models.levels.kurtosis import GAUSSIAN, departure, fallen_by_beats, fallen_by_lines, varied, without_lines
 from models.levels.limits import (
     MEASURE_WORDS,
     PEAK_TO_PEAK,
@@ -259,8 +259,9 @@ class LevelJudge:
             orders, in_bands = levels.moments[2][:, :, column], levels.moments[3][:, :, column]
             strongest = None if levels.lines is None else levels.lines[:, :, column]
             before, speed_rad_s = (state.bands.get(name), state.lines.get(name, ())), levels.speed_rad_s or 0.0
-            lines = fallen_by_lines(levels.bands, in_bands, orders, speed_rad_s, *before, strongest)
-            hops = hops + lines + fallen_by_beats(levels.moments[0][:, column], healthy)
+            lines, varies = fallen_by_lines(levels.bands, in_bands, orders, speed_rad_s, *before, strongest)
+            beats = fallen_by_beats(varied(levels.moments[0][:, column]), healthy)
+            hops = hops + np.maximum(lines + beats, fallen_by_beats(varies, healthy))
             return found if departure(hops, healthy, n_errors) < 0 else 0.0
         if found and healthy.mean < GAUSSIAN:
             random = without_lines(healthy)

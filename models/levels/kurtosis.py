@@ -110,10 +110,11 @@ def fallen_by_lines(
     healthy: BandReference | None,
     healthy_parts: Sequence[float] = (),
     strongest: FloatArray | None = None,
-) -> FloatArray:
+) -> tuple[FloatArray, float]:
     """How much lines that have begun or grown, such as a gear mesh, lower a channel's kurtosis, shape (n_hops,).
 
     The power of a line beside an order, such as mains hum beside 2x, is that of the order's bands less the order's own.
+    Last, the variance of the mean square of a hop over its square if all bands hold noise, see `fallen_by_beats`.
 
     Parameters
     ----------
@@ -145,18 +146,24 @@ def fallen_by_lines(
     fallen = np.maximum((of_lines[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
     beside = np.maximum(in_bands @ near.T - np.abs(orders) ** 2 / 2, 0.0)
     fallen += ((beside / total[:, None]) ** 2)[:, _holds_line(beside, near @ freedom)].sum(axis=1)
-    return np.asarray(1.5 * fallen, dtype=np.float64)
+    noise = np.hstack([in_bands[:, ~near.any(axis=0)], beside]).mean(axis=0) / total.mean()
+    varies = noise**2 @ (2 / np.maximum(np.append(freedom[~near.any(axis=0)], near @ freedom), 1.0))
+    return np.asarray(1.5 * fallen, dtype=np.float64), float(varies)
 
 
-def fallen_by_beats(square: FloatArray, healthy: HopReference) -> float:
+def varied(square: FloatArray) -> float:
+    """Variance of the mean square of a hop, shape (n_hops,), over its square, without a slow change of the load."""
+    steps = float(np.mean(np.diff(square) ** 2)) if len(square) > 1 else 0.0
+    return steps / 2 / max(float(square.mean()) ** 2, np.finfo(float).tiny)
+
+
+def fallen_by_beats(varies: float, healthy: HopReference) -> float:
     """How much the beats of narrow modes lower a channel's kurtosis by more than on the healthy machine.
 
-    They make the mean square of a hop, `square`, shape (n_hops,), vary by chance, by which the mean of its square, the
-    denominator of kurtosis, exceeds the square of its mean. Only steps between hops count, no slow change of the load.
+    They make the mean square of a hop vary by chance. By this variance, over its square, the mean of its square, the
+    denominator of kurtosis, exceeds the square of its mean.
     """
-    varies = float(np.mean(np.diff(square) ** 2)) / 2 if len(square) > 1 else 0.0
-    lowered = GAUSSIAN * varies / max(float(square.mean()) ** 2, np.finfo(float).tiny)
-    return max(0.0, lowered - max(0.0, GAUSSIAN - healthy.mean))
+    return max(0.0, GAUSSIAN * varies - max(0.0, GAUSSIAN - healthy.mean))
 
 
 def _holds_line(power: FloatArray, freedom: FloatArray) -> BoolArray:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from models.alarm_names import LEVEL
+from models.commissioning.checks import Check, check_agreement
 from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import (
     FILE,
@@ -422,6 +423,22 @@ def test_a_longer_recording_lowers_commissioning_errors_and_detectable_changes()
         assert sure(one.commissioning_error) > 1.3 * sure(other.commissioning_error)
         assert sure(one.detectable_loss) < sure(other.detectable_loss) < 0
     assert isinstance(much.commissioned, Commissioned)
+
+
+def test_a_reading_that_a_window_does_not_determine_is_not_compared_between_the_halves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in the monitor: a damping known to 110 % only had let its plane's unbalance look changed, at 0.7 errors."""
+    compared: list[Diagnosis] = []
+
+    def check(machine: MachineFile, diagnoses: Sequence[Diagnosis]) -> Check:
+        compared.extend(diagnoses)
+        return check_agreement(machine, diagnoses)
+
+    monkeypatch.setattr("models.commissioning.levels.check_agreement", check)
+    monkeypatch.setattr("models.diagnosis.verdict.stretch._VAGUE", 0.05)  # of a window three times as long
+    commissioned(NOTHING, healthy(NOTHING, 46.0, 46))
+    assert [[one.name for one in each.evaluable] for each in compared] == 2 * [["k_by", "k_bz", "e"]]
 
 
 @pytest.mark.parametrize(("segment_s", "noted"), [(0.25, True), (2.0, False)])
