@@ -93,9 +93,9 @@ def of_displacements(order: Sequence[str], sign: str = "") -> Commissioning:
 
 
 def no_such_rotor() -> Commissioning:
-    """With the damping known, few first guesses differ."""
-    given = {name: getattr(LAB.rotor, name) for name in ("c_by_N_s_per_m", "c_bz_N_s_per_m")}
-    given |= {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.3 * LAB.rotor.m2_kg}
+    """With stiffness and damping known, there is one first guess, which the masses put too far off."""
+    given = LAB.rotor.model_dump(include={"k_by_N_per_m", "k_bz_N_per_m", "c_by_N_s_per_m", "c_bz_N_s_per_m"})
+    given |= {"m1_kg": 8 * LAB.rotor.m1_kg, "m2_kg": 8 * LAB.rotor.m2_kg}
     wrong = PARTIAL.model_copy(update={"rotor": sure(PARTIAL.rotor).model_copy(update=given)})
     machine, blocks = with_sensors(wrong, stream(45.0, 43), lambda sensor: sensor.direction != "z")
     return made_of(blocks, machine)
@@ -135,7 +135,7 @@ NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the 
         pytest.param(lambda: made_of(stream(90.0, 55, SOFTENING)), {
             "halves agree": "refused: bearing stiffness, horizontal differs between the halves",
         }, marks=pytest.mark.slow),
-        (lambda: made_of(stream(HEALTHY_S, 52), SOFTER), {
+        (lambda: made_of(stream(45.0, 43), SOFTER), {
             "agrees with the parameters in the machine file":
                 "refused: bearing stiffness, horizontal differs between the healthy data and the parameters"
                 r".*; .*leave out of \[rotor\]",
@@ -143,13 +143,13 @@ NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the 
         (lambda: made_of(stream(HEALTHY_S, 52), COARSE), {
             "window settings": "refused: .*lags are 2.5 ms apart.*; .*change lag_step_s",
         }),
-        pytest.param(no_such_rotor, {
-            "can be learned": r"refused: .*; .*leave \[rotor\] out of the machine file",
-        }, marks=pytest.mark.slow),
+        (no_such_rotor, {"can be learned": r"refused: .*; .*leave \[rotor\] out of the machine file"}),
         (lambda: made_of(stream(45.0, 43), THICK), {"can be learned": r"refused: .*; .*leave \[rotor\] out of the"}),
         (lambda: of_displacements(("z1", "y1", "y2", "z2", "theta")), {"sensors": SWAPPED}),
         (lambda: of_displacements(("y1", "z1", "z2", "y2", "theta")), {"sensors": SWAPPED}),
-        (lambda: of_displacements(("y2", "z1", "y1", "z2", "theta")), {"": NO_RELATION}),
+        pytest.param(
+            lambda: of_displacements(("y2", "z1", "y1", "z2", "theta")), {"": NO_RELATION}, marks=pytest.mark.long
+        ),
         (lambda: of_displacements(("y1", "z1", "y2", "z2", "theta"), sign="y2"), {"": NO_RELATION}),
     ],
     ids=[
