@@ -47,9 +47,9 @@ STEP = "% of nominal from one hop to the next, evaluation limit 1.4 %"
             WITHOUT_ANGLE, 98.0, Event(at_s=65.0, speed_rpm=1.35 * RPM, ramp_s=30.0),
             ["5 of 12 hops, evaluation limit 50%", "the speed left 1056 to 1584 rpm"],
         ),
-        (
+        pytest.param(
             WITHOUT_ANGLE, 95.0, Event(at_s=65.0, speed_rpm=0.3 * RPM, ramp_s=14.0),
-            ["5 of 12 hops, evaluation limit 50%"],
+            ["5 of 12 hops, evaluation limit 50%"], marks=pytest.mark.long,
         ),
     ],
 )  # fmt: skip
