@@ -302,7 +302,7 @@ def test_a_cracked_rotor_moves_as_the_equation_of_motion_says() -> None:
     assert np.abs(expected - synchronous).max(axis=0)[1] > 0.2 * scale[1]
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.2])
+@pytest.mark.parametrize("friction", [pytest.param(0.0, marks=pytest.mark.long), 0.2])
 def test_a_rubbing_rotor_moves_as_the_equation_of_motion_says(friction: float) -> None:
     condition = _anomalous(rub=0.5, friction=friction)
     expected = _solved(LAB, 1000, _contact(friction))

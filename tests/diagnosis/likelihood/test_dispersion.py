@@ -32,7 +32,7 @@ def gusty(number: int, anomaly: Anomaly = Anomaly.NONE) -> WindowStatistics:
     return replace(gusts, segments=segments, spectrum=summed(segments) / gusts.n_segments)
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.long) for number in (1, 2))])
 def test_gusts_are_no_misfit(number: int) -> None:
     diagnosis = LikelihoodFit(LAB).diagnose(gusty(number))
     assert sure(diagnosis.misfit_z) < MOST_MISFIT

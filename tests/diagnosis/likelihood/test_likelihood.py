@@ -421,7 +421,7 @@ def test_a_converter_that_samples_channels_one_after_another_is_suspected(layout
     assert delay_us == pytest.approx(apart_us, rel=0.3)
 
 
-@pytest.mark.parametrize("at", [{}, {"y1": (45, 135), "y2": (30, 120)}])
+@pytest.mark.parametrize("at", [pytest.param({}, marks=pytest.mark.long), {"y1": (45, 135), "y2": (30, 120)}])
 def test_a_delayed_channel_is_suspected_whatever_its_mounting(at: dict[str, tuple[float, float]]) -> None:
     lab, window = probes_of_lab(Layout.ONE_SOURCE)
     machine = mounted(lab, at)

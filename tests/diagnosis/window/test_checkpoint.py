@@ -132,7 +132,7 @@ def windows(spread: float = 0.0) -> tuple[WindowStatistics, ...]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("spread", "corners"), [(0.0, 1), (0.01, CORNERS)])
+@pytest.mark.parametrize(("spread", "corners"), [pytest.param(0.0, 1, marks=pytest.mark.long), (0.01, CORNERS)])
 def test_a_maximum_followed_over_many_windows_continues_bit_for_bit(spread: float, corners: int) -> None:
     """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
     fit, running = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB, follow=True)
