@@ -19,7 +19,7 @@ from tests.service.rig.watching import feed, held, raised, resumed
 from tests.sure import sure
 
 KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0, "max_span_s": 60.0})})
-DEAD_S, CHANGE_S, END_S = 35.0, 50.0, 90.0
+DEAD_S, CHANGE_S, END_S = 35.0, 50.0, 83.0
 
 
 def dying(
@@ -106,7 +106,7 @@ def test_an_identified_machine_is_diagnosed_without_a_dead_sensor() -> None:
 def test_a_change_is_named_although_a_gain_has_drifted(gains: dict[str, float]) -> None:
     """Without the one of two sensors that has drifted, the theory explains the window."""
     monitor = MachineMonitor(identified(), remembered=True)
-    stream = factored(KIT, scenario_blocks(110.0, parse_fault("k_by=-0.2@70"))[300:], **gains)
+    stream = factored(KIT, scenario_blocks(103.0, parse_fault("k_by=-0.2@70"))[300:], **gains)
     reports, _ = feed(monitor, stream[:395])
     full = [one for one in reports if one.filled == 1]
     assert len(full) == 2
