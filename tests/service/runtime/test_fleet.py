@@ -48,6 +48,8 @@ def cluster() -> Iterator["Cluster"]:
     head = {
         "num_cpus": 0,
         "include_dashboard": False,
+        "include_log_monitor": False,
+        "no_monitor": True,  # of the autoscaler
         "_system_config": {"worker_niceness": 0} | json.loads(HEALTH_CHECKS),
     }
     made = Cluster(initialize_head=True, head_node_args=head)
