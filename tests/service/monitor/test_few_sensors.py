@@ -31,7 +31,7 @@ def damped() -> Machine:
 def test_a_name_has_low_confidence_only_if_a_heavier_disc_explains_the_data_as_well(
     event: Event, *, told: bool
 ) -> None:
-    _, events = feed(MachineMonitor(Installed(damped())), healthy_blocks(damped(), 170.0, SEED, event, block_s=1.0))
+    _, events = feed(MachineMonitor(Installed(damped())), healthy_blocks(damped(), 135.0, SEED, event, block_s=1.0))
     raised = {one.alarm.name: one for one in events if one.kind == "raised" and one.alarm.name in PARAMETERS}
     assert raised
     assert told or set(raised) == {event.parameter}
