@@ -353,9 +353,13 @@ class WindowLevels:
                 return np.full(known.shape[1], True)
             steps = np.abs(np.diff(known, axis=0)) ** 2
             # Where a line begins, it makes one of the steps. Where the speed changes, 2x passes resonances, in which
-            # the noise of a few hops exceeds that of all others.
-            power = _mean(steps) if self.unsteady > NEIGHBOURHOOD else np.median(steps, axis=0) / math.log(2)
-            return np.asarray(np.abs(self.vectors[2]) < ERRORS * np.sqrt(power / (2 * len(known))))
+            # the noise of a few hops exceeds that of all others. The noise may have grown within the window.
+            typical = np.maximum(*(np.median(some, axis=0) for some in (steps, steps[len(steps) // 2 :])))
+            power = _mean(steps) if self.unsteady > NEIGHBOURHOOD else typical / math.log(2)
+            # One hop in which something hit the machine, or after a gap, is no state of it.
+            others = (known.sum(axis=0) - known[np.abs(known).argmax(axis=0), range(known.shape[1])]) / (len(known) - 1)
+            least = np.minimum(np.abs(self.vectors[2]), np.abs(others))
+            return np.asarray(least < ERRORS * np.sqrt(power / (2 * len(known))))
         at = int(np.searchsorted(self.bands.edges_hz, abs(self.speed_rad_s) / np.pi)) - 1
         if not 0 <= at < len(self.bands.rms) or not len(known):
             return None

@@ -216,6 +216,14 @@ def test_beats_are_no_rub_in_a_window_whose_hops_differ_little_by_chance() -> No
     assert sum(map(bool, suspects([0.0] * 40, 0.0, lambda samples: ringing(samples, 12.0, 0.012)))) <= 1
 
 
+def test_vibration_that_grows_or_one_disturbed_hop_is_no_2x_and_a_2x_that_begins_in_the_window_is_found() -> None:
+    assert suspects([0.0] * 20, 0.0, lambda samples: np.where(LATE, 20.0, 1.0) * samples) == [""] * 20
+    hop = np.where(T // HOP_S == 4, 6 * np.cos(2 * THETA), 0.0)
+    assert suspects([0.0] * 4, 0.0, lambda samples: samples + hop) == [""] * 4
+    twice = np.where(LATE, 3 * np.cos(2 * THETA + 1), 0.0)
+    assert all(" 2x " in one for one in suspects([0.0] * 4, 0.0, lambda samples: samples + twice))
+
+
 @pytest.mark.parametrize("phase", [True, False])
 def test_louder_vibration_is_no_2x_and_a_2x_within_it_is_found(*, phase: bool) -> None:
     def louder(samples: FloatArray) -> FloatArray:
