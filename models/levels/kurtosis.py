@@ -142,12 +142,13 @@ def fallen_by_lines(
         of_lines = np.where(alone, np.minimum(in_bands, OF_BIN * strongest), in_bands)
         before = np.where(alone, before * np.minimum(1.0, OF_BIN * np.array(healthy_parts)), before)
         freedom_of_lines = np.where(alone, 2.0, freedom)
-    lines = ~near.any(axis=0) & _holds_line(of_lines, freedom_of_lines)
+    apart = ~near.any(axis=0)
+    lines = apart & _holds_line(of_lines, freedom_of_lines)
     fallen = np.maximum((of_lines[:, lines] / total[:, None]) ** 2 - before[lines] ** 2, 0.0).sum(axis=1)
     beside = np.maximum(in_bands @ near.T - np.abs(orders) ** 2 / 2, 0.0)
     fallen += ((beside / total[:, None]) ** 2)[:, _holds_line(beside, near @ freedom)].sum(axis=1)
-    noise = np.hstack([in_bands[:, ~near.any(axis=0)], beside]).mean(axis=0) / total.mean()
-    varies = noise**2 @ (2 / np.maximum(np.append(freedom[~near.any(axis=0)], near @ freedom), 1.0))
+    noise = np.hstack([in_bands[:, apart], beside]).mean(axis=0) / total.mean()
+    varies = noise**2 @ (2 / np.maximum(np.append(freedom[apart], near @ freedom), 1.0))
     return np.asarray(1.5 * fallen, dtype=np.float64), float(varies)
 
 
