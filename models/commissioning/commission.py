@@ -293,6 +293,7 @@ def commission(
             lines=tuple(sorted(lines)),
             baselines=learned.baselines,
             shape=learned.shape,
+            modes=learned.modes,
             sensors=learn_sensor_reference(windows),
             levels=learn_levels(
                 "commissioned",

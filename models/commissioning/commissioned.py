@@ -26,6 +26,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.baseline.stored import Baseline
 from models.diagnosis.misfit import HealthyMisfit
+from models.diagnosis.modes import HealthyModes
 from models.diagnosis.networks.bundle import MANIFEST, Bundle, load_bundle
 from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.shape import HealthyShape
@@ -247,6 +248,11 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
         default=(), description="level none: one for all conditions, or one for each speed where they differ"
     )
     shape: HealthyShape | None = Field(default=None, description="where no equation can be evaluated, or beside it")
+    modes: HealthyModes | None = Field(
+        default=None,
+        exclude_if=lambda found: found is None,
+        description="level none: where the stiffness of a plane is read badly or not at all",
+    )
     sensors: SensorReference | None = None
     levels: LevelReference | None = Field(default=None, description="vibration levels of the healthy machine")
 

@@ -31,7 +31,14 @@ from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import Identified, compare, has_angle, identify, unresolved
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.lag_moments import passband_hz
-from models.diagnosis.baseline.learned import disagreements, learn_baseline, planes_coupled, undetermined, unsuitable
+from models.diagnosis.baseline.learned import (
+    disagreements,
+    learn_baseline,
+    planes_coupled,
+    references_of,
+    undetermined,
+    unsuitable,
+)
 from models.diagnosis.baseline.rows import (
     COUPLED_ROWS,
     ROWS,
@@ -42,6 +49,7 @@ from models.diagnosis.baseline.rows import (
     not_measured,
 )
 from models.diagnosis.baseline.stored import Baseline
+from models.diagnosis.modes import HealthyModes, learn_modes
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
 from models.diagnosis.verdict.sequential import SequentialSettings
@@ -62,6 +70,8 @@ _OPPOSITE = (
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
 _NO_CHANCE = 3.0  # standard errors beyond which an identified value is not the file's
+_WELL = 0.03  # standard error of a stiffness up to which its reading shows more than natural frequencies do
+_TEXT_OF = {"y": "horizontal", "z": "vertical"}
 _SHORTEST_HOPS = 4  # with fewer hops, their scatter is too uncertain
 
 
@@ -77,6 +87,7 @@ class Learned:
     gyroscopic: Gyroscopic = "Eq. 27"
     baselines: tuple[ConditionBaseline, ...] = ()
     shape: HealthyShape | None = None
+    modes: HealthyModes | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -196,7 +207,7 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
         check = _no_equations("these sensors allow no equation", no_shape, advice)
     else:
         try:
-            return replace(_with_relations(machine, pieces, progress), shape=shape)
+            return _with_modes(machine, windows, replace(_with_relations(machine, pieces, progress), shape=shape))
         except EstimationError as error:
             if shape is None:
                 raise
@@ -204,7 +215,29 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
     if shape is None:
         return Learned((check,))
     powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
-    return Learned((check, check_shapes(machine, powers, shape.windows)), shape=shape)
+    return _with_modes(machine, windows, Learned((check, check_shapes(machine, powers, shape.windows)), shape=shape))
+
+
+def _with_modes(machine: MachineFile, windows: Sequence[WindowStatistics], learned: Learned) -> Learned:
+    """The same with natural frequencies to watch, if the stiffness of a measured plane is read badly or not at all."""
+    read = [each for _, _, each in learned.diagnoses]
+    vague = [_TEXT_OF[plane] for plane in "yz" if _vague(plane, windows[0].states, read)]
+    modes = learn_modes([one.without_lines for one in windows], references_of(windows[0].states)) if vague else None
+    if modes is None:
+        return learned
+    limits = modes.limits(SequentialSettings.for_machine(machine, short=False).shape_rate)
+    watched = ", ".join(f"{one.frequency_hz:.4g} Hz (by {limit:.1%})" for one, limit in limits)
+    note = (
+        f"In the {' and '.join(vague)} plane no relation tells the stiffness to {_WELL:.0%}, so natural frequencies "
+        f"are watched; a change is reported once two windows without common data show it: {watched}."
+    )
+    return replace(learned, modes=modes, notes=(*learned.notes, note)) if limits else learned
+
+
+def _vague(plane: str, states: Sequence[str], read: Sequence[Diagnosis]) -> bool:
+    errors = [one.standard_error for each in read for one in each.evaluable if one.name == f"k_b{plane}"]
+    known = [error for error in errors if error is not None and error <= _WELL]
+    return any(state[0] == plane for state in states) and 2 * len(known) <= len(read)
 
 
 def _no_equations(why: str, no_shape: str, advice: str) -> Check:

@@ -11,7 +11,16 @@ from pydantic import Field
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Number, OfMachine, Reason, Record
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
-from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
+from rotorwatch.records.windows import (
+    Detectable,
+    Equation,
+    NaturalFrequency,
+    Opinion,
+    Parameter,
+    SensorFault,
+    Shape,
+    Verdict,
+)
 
 
 class HealthState(StrEnum):
@@ -82,6 +91,13 @@ class Report(OfMachine):
     shapes: tuple[Shape, ...] = Field(
         default=(),
         description="if no equation can be evaluated: whether each channel vibrates as when healthy",
+        examples=[()],
+    )
+    natural_frequencies: tuple[NaturalFrequency, ...] = Field(
+        default=(),
+        exclude_if=lambda value: not value,
+        description="if nothing else shows a change of a stiffness well: whether natural frequencies are those of the "
+        "healthy machine; left out otherwise",
         examples=[()],
     )
     levels: tuple[ChannelLevels, ...] = Field(default=(), description="vibration levels, channel by channel")

@@ -209,3 +209,17 @@ class Shape(Record):
     z: Number = Field(description="distance from the healthy shape, a standard normal value", examples=[0.4])
     limit: float = Field(description="z above which the channel is reported as changed", examples=[3.1])
     text: str = Field(description="the same in a sentence", examples=["y1: not changed"])
+
+
+class NaturalFrequency(Record):
+    """Whether a natural frequency is that of the healthy machine; watched where a stiffness is not known well."""
+
+    healthy_hz: float = Field(description="natural frequency of the healthy machine, Hz", examples=[11.8])
+    hz: Number = Field(description="natural frequency in this window, Hz; null if not found", examples=[11.85])
+    change: Number = Field(description="relative change", examples=[0.004])
+    limit: float = Field(description="relative change beyond which it is reported as changed", examples=[0.03])
+    verdict: str = Field(description="not changed, changed or not evaluable", examples=["not changed"])
+    text: str = Field(
+        description="the same in a sentence",
+        examples=["natural frequency 11.8 Hz: not changed (now 11.85 Hz, +0.4%, limit 3.0%)"],
+    )

@@ -24,7 +24,7 @@ from models.machine import Operation
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
-from rotorwatch.records.windows import Equation, Opinion, Parameter, SensorFault, Shape
+from rotorwatch.records.windows import Equation, NaturalFrequency, Opinion, Parameter, SensorFault, Shape
 
 _OR_STIFFNESS = "or the stiffness there has changed, which looks the same well below its resonance"
 _TOO_LITTLE = "something changed within the window, and data since then are too few to say what"
@@ -45,6 +45,7 @@ class Evaluation:
     opinions: tuple[Opinion, ...]  # readings of the other diagnosticians
     speed_rad_s: float | None
     shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's shape has changed
+    modes: tuple[NaturalFrequency, ...] = ()  # where a stiffness is read badly or not at all
     gyroscopic: Literal["", "opposite"] = ""  # sense of the gyroscopic moments where it is not that of Eq. (27)
     alone: bool = False  # whether only later windows can show that this one straddles a change
 
@@ -100,12 +101,13 @@ class Evaluation:
 
     @property
     def unlike_healthy(self) -> str:
-        """What differs from the healthy machine, where no equation can be evaluated."""
+        """What differs from the healthy machine where no equation can be evaluated, or in natural frequencies."""
         return "; ".join(filter(None, (self.deciding.suspect, *self._changed)))
 
     @property
     def _changed(self) -> list[str]:
-        return [shape.text for shape in self.shapes if shape.verdict == "changed"]
+        judged: tuple[NaturalFrequency | Shape, ...] = (*self.modes, *self.shapes)
+        return [one.text for one in judged if one.verdict == "changed"]
 
     def reason(self, *, told: bool) -> str:
         """Why no parameter could be read, each reason once; shapes that have changed come first.

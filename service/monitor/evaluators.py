@@ -28,11 +28,11 @@ from models.errors import EstimationError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
-from rotorwatch.records.windows import Equation, SensorFault
+from rotorwatch.records.windows import Equation, NaturalFrequency, SensorFault
 from service.monitor.evaluation import Evaluation, LatestRotation, Newest, WindowEvaluator, settled
 from service.monitor.known_machine import KnownMachineEvaluator
 
-_SHAPE, _ROTATION = "shape", "rotation"
+_SHAPE, _ROTATION, _MODES = "shape", "rotation", "modes"
 # Standard deviations of the misfit: up to which a window holds no change and a shorter stretch is explained, and by how
 # many a stretch's misfit must be below its share of the window's to be of another machine than the rest.
 _MOST_MISFIT_Z, _LESS = 2.0, 3.0
@@ -77,7 +77,8 @@ class BaselineEvaluator(WindowEvaluator):
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
         self._lines = commissioned.lines != ()  # without any, relations were learned with all lines left in
-        self._shape = commissioned.shape
+        self._shape, self._modes = commissioned.shape, commissioned.modes
+        self._beyond_ns = (0,) * (0 if self._modes is None else len(self._modes.modes))
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, BaselineDiagnostician(one.baseline)) for one in commissioned.baselines)
@@ -117,15 +118,22 @@ class BaselineEvaluator(WindowEvaluator):
             deciding = Diagnosis(_SHAPE, nothing, covariance=np.zeros((0, 0)))
         alike = None if deciding.evaluable or window.lost else self._shape
         shapes = () if alike is None else alike.judge(window, self._shape_rate)
-        return Evaluation(deciding, short, _row_readings(deciding, window), (), speed, shapes, alone=not short)
+        modes: tuple[NaturalFrequency, ...] = ()
+        if self._modes is not None and not window.lost:
+            modes, self._beyond_ns = self._modes.judge(window.without_lines, self._beyond_ns, self._shape_rate)
+        rows = _row_readings(deciding, window)
+        return Evaluation(deciding, short, rows, (), speed, shapes, modes, alone=not short)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Power of the rotation line, see `LatestRotation`."""
-        return {_ROTATION: np.array(self._rotation.power)}
+        """Power of the rotation line, see `LatestRotation`, and since when natural frequencies are beyond limits."""
+        modes = {_MODES: np.array(self._beyond_ns)} if self._beyond_ns else {}
+        return {_ROTATION: np.array(self._rotation.power), **modes}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from where `checkpoint` was called, see `WindowEvaluator`."""
         self._rotation.power = float(checked(arrays, _ROTATION, np.float64, ()))
+        if self._beyond_ns:
+            self._beyond_ns = tuple(checked(arrays, _MODES, np.int64, (len(self._beyond_ns),)).tolist())
 
     def _diagnose(self, window: WindowStatistics) -> Diagnosis:
         baseline = self._baseline_for(window)

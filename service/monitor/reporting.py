@@ -125,7 +125,7 @@ class WindowReporter:
             verdict, test.unexplained, deciding.suspect, end_ns, astride_s, hidden=foreign.hides, rival=rival
         )
         levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
-        if evaluation.shapes:
+        if evaluation.shapes or evaluation.modes:
             changed, evidence = evaluation.unlike_healthy, Evidence(start_ns=start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
         read = bool(verdict.current)
@@ -147,6 +147,7 @@ class WindowReporter:
             detectable=() if deciding.unexplained else detectable_changes(look, limits, self._machine.window.length_s),
             reason=reason,
             shapes=evaluation.shapes,
+            natural_frequencies=evaluation.modes,
         )
 
     def _beside_rivals(self, verdict: Verdict) -> tuple[Verdict, str | None]:

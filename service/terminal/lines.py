@@ -33,6 +33,7 @@ def report_line(report: Report) -> str:
             changed = f"changed: {_names(verdict) or '?'}" if _found(verdict) else "no change"
             told.append(changed + _OUTSIDE * verdict.outside_model)
         told += [_opinion(opinion) for opinion in report.opinions]
+        told += [one.text for one in report.natural_frequencies if one.verdict == "changed"]
     else:
         told = [one.text for one in report.levels if report.state == "watching" or one.beyond]
         if report.shapes:  # no parameter can be read on this machine: growth of levels, or the reason

@@ -17,7 +17,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.levels import LevelGrowth
-from rotorwatch.records.windows import Shape
+from rotorwatch.records.windows import NaturalFrequency, Shape
 from service.commands.running import exit_codes
 from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
@@ -224,6 +224,9 @@ def test_reports_alarms_and_health_as_terminal_lines() -> None:
     assert report_line(settled.model_copy(update={"parameters": (sharp,)})) == f"{start}k_by +0.500±0.039 %{tail}"
     blind = report.parameters[0].model_copy(update={"relative_change": None})
     assert report_line(settled.model_copy(update={"parameters": (blind,)})) == f"{start}k_by n/a{tail}"
+    moved = NaturalFrequency.model_validate(example(NaturalFrequency)).model_copy(update={"verdict": "changed"})
+    frequencies = {"natural_frequencies": (moved, moved.model_copy(update={"verdict": "not changed"}))}
+    assert report_line(report.model_copy(update=frequencies)).endswith(f"agrees  |  {moved.text}")
     unread = {"level_growth": None, "reason": "y1: changed", "levels": ()}
     assert report_line(report.model_copy(update={**unread, "shapes": (shape,)})) == f"{start}y1: changed"
     seen = LevelGrowth.model_validate(example(LevelGrowth))

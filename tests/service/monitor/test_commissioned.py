@@ -1,11 +1,17 @@
 """The monitor of a machine commissioned without known parameters, from block to alarm."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from benchmarks.finite_elements.machines import rotor_named
+from benchmarks.finite_elements.observed import WindowSizes, machine_of, sampled
+from benchmarks.finite_elements.observed import blocks as observed_blocks
+from benchmarks.finite_elements.scenes import SceneRange, SourceLayout, drawn_condition
+from benchmarks.studies.subjects.watched import commissioned as watched
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.levels.settings import LevelSettings
@@ -364,6 +370,27 @@ def test_with_too_few_sensors_only_a_change_of_shape_and_levels_is_reported() ->
     assert full(windows)[-1].state in {HealthState.ALERT, HealthState.DANGER}
     assert "has changed shape" in full(windows)[-1].reason.partition("; ")[0]
     assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
+
+
+def test_where_no_equation_can_be_evaluated_a_natural_frequency_shows_a_softer_bearing() -> None:
+    rotor, sizes, probes = rotor_named("overhung"), WindowSizes(length_s=30.0), ("y1", "z1")
+    file = at_once(machine_of(rotor, sizes, probes))
+
+    def recorded(number: int, duration_s: float, **changes: float) -> list[SampleBlock]:
+        rng = np.random.default_rng([SEED, number])
+        limits = replace(SceneRange(), speed_relative=(1.0, 1.0))
+        drawn = drawn_condition(rotor, SourceLayout.INDEPENDENT, limits, changes, rng)
+        return list(observed_blocks(sampled(rotor, drawn, duration_s, [SEED, number], probes), file.descriptor))
+
+    made = watched(file, *(recorded(number, 150.0) for number in range(3)))
+    assert isinstance(made, Installed)
+    monitor = MachineMonitor(made)
+    windows, events = feed(monitor, recorded(3, 90.0, k_by=-0.3))
+    verdicts = [{one.verdict for one in window.natural_frequencies} for window in full(windows)]
+    assert not any("changed" in found for found in verdicts[:5])  # these share data with the first window
+    assert "changed" in verdicts[-1]
+    assert "natural frequency" in full(windows)[-1].reason
+    assert "shape" in {event.alarm.name for event in events}
 
 
 @pytest.mark.long  # in short, a wrong gain is no change of a parameter

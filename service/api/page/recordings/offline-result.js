@@ -143,7 +143,7 @@ class OfflineResult extends LiveElement {
       html("div", { class: "states" }, html("state-mark", { state: report.state }), html("span", { class: "number" }, `${(100 * report.filled).toFixed(0)} % full${report.speed_rad_s === null ? "" : `, ${figure((report.speed_rad_s * 30) / Math.PI)} rpm`}`)),
       html("p", { class: "reason" }, report.reason),
       html("p", { class: "verdict" }, report.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`),
-      html("ul", {}, ...[...report.sensors, ...report.shapes].map((one) => html("li", {}, one.text))),
+      html("ul", {}, ...[...report.sensors, ...report.shapes, ...(report.natural_frequencies ?? [])].map((one) => html("li", {}, one.text))),
       html("p", {}, standing.length ? "Raised in the replay by then: " : "No alarm raised in the replay by then.", standing.map((one) => `${one.name} (${one.severity}${one.relative_change === null ? "" : `, ${percent(one.relative_change)}`})`).join(", ")),
     );
     for (const one of this.#tables) one.feed(health);

@@ -14,7 +14,7 @@ from rotorwatch.records.fields import EXAMPLE_NS
 from rotorwatch.records.health import Health
 from rotorwatch.records.history import ReadingBucket
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth, LevelLimits
-from rotorwatch.records.windows import SensorFault, Shape
+from rotorwatch.records.windows import NaturalFrequency, SensorFault, Shape
 from service.access.scopes import Scope
 from service.runtime.runtime import Runtime
 from tests.service.api.page.browsing import (
@@ -197,6 +197,7 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
     report: dict[str, Any] = told["report"] | {
         "state": "watching", "suspect": "a rub at the bearing", "level_growth": example(LevelGrowth),
         "sensors": [example(SensorFault)], "shapes": [example(Shape)],
+        "natural_frequencies": [example(NaturalFrequency)],
     }  # fmt: skip
     report["opinions"][0]["agreement"][0]["verdict"] = "disagree"
     told |= {"report": report, "reason": "<b>reason</b> & more"}
@@ -218,7 +219,13 @@ def test_everything_in_a_report_is_on_the_machines_page(browser: Browser, plant:
         quality = told["quality"]
         for text in (
             *(verdict["text"], "Best explained by: a rub at the bearing.", report["sensors"][0]["text"]),
-            *(report["shapes"][0]["text"], growth[1:], quality["last_refusal"], quality["last_gap"]),
+            *(
+                report["shapes"][0]["text"],
+                report["natural_frequencies"][0]["text"],
+                growth[1:],
+                quality["last_refusal"],
+                quality["last_gap"],
+            ),
             *("not-finite 3", told["restart"], "1320 rpm", "0.4 standard deviations", "zone", "detectable", "relation"),
             *(told["alarms"][0]["text"], "−24.7 %", "disagrees"),
         ):
