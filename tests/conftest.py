@@ -55,7 +55,7 @@ _LONGEST = (
     "test_baseline_coupling", "test_baseline_growth", "test_hosts", "test_tutorial", "test_commission_cli",
     "test_unbalance", "test_browser_plots", "test_hostile_messages", "test_lines", "test_following", "test_fallback",
     "test_plots_cli", "test_baseline_force", "test_installation_cli", "test_heavy_spot", "test_replay_cli",
-    "test_import_properties", "test_conditions", "test_replay_identity", "test_demo", "test_history_lost", "test_pins",
+    "test_import_properties", "test_conditions", "test_replay_network", "test_demo", "test_history_lost", "test_pins",
     "test_browser_administration", "test_packages", "test_paper", "test_scenarios", "test_recorded_windows",
     "test_page_types", "test_evidence", "test_survives",
 )  # fmt: skip

@@ -22,7 +22,6 @@ from service.history.records import Retention
 from service.history.store import Store
 from service.settings.access import AccessSettings, LimitSettings
 from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem
-from tests.service.rig.live import until
 from tests.service.rig.postgres import executed
 
 READ, OPERATE, CONFIGURE = Scope
@@ -144,27 +143,6 @@ def test_health_and_readiness_probes_are_not_rate_limited(tmp_path: Path) -> Non
 def _asked(monitor: Guarded, token: str) -> int:
     with monitor.client(token) as client:
         return client.get("/health").status_code
-
-
-def test_event_streams_are_limited_per_caller_and_in_total(tmp_path: Path) -> None:
-    limits = LimitSettings(streams_per_caller=2, streams=3)
-    with guarded(tmp_path, AccessSettings(limits=limits)) as monitor:
-        seats = monitor.guard.seats
-        one, other = monitor.client(monitor.token(READ)), monitor.client(monitor.token(READ))
-        with one, other:
-            with one.stream("GET", "/events") as first, one.stream("GET", "/events"):
-                # Piece by piece: the stream has no end.
-                pieces = first.iter_text()
-                assert "data: 0" in next(pieces)
-                refused = one.get("/events")
-                assert "of your event streams" in problem(refused, 429)
-                assert int(refused.headers["retry-after"]) >= 1
-                with other.stream("GET", "/events") as third:
-                    assert third.status_code == 200
-                    assert "the most this service allows" in problem(other.get("/events"), 429)
-            until(lambda: seats.taken == 0, "streams that were left give their seats back")
-            with one.stream("GET", "/events") as again:
-                assert again.status_code == 200
 
 
 def test_actions_are_audited_before_and_after(monitor: Guarded) -> None:

@@ -1,5 +1,6 @@
 """An unconnected sensor is shown as missing data, not as zeros; other sensors are shown as usual."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from models.commissioning.commissioned import Installed, install
 from models.errors import RotorwatchError
 from models.signals.block import SampleBlock
+from rotorwatch.records.health import Report
 from service.analysis.figures.run_up import centreline, polar
 from service.analysis.figures.style import Look
 from service.analysis.past import Past
@@ -34,7 +36,7 @@ from tests.service.analysis.snapshotting import snapshots_of
 from tests.service.monitor.test_monitor_missing import KIT, RIG
 from tests.service.rig.live import START_NS, scenario_blocks
 from tests.service.rig.replaying import recorded, recording
-from tests.service.rig.watching import held
+from tests.service.rig.watching import feed, held
 from tests.sure import sure
 
 NAMES = [one.name for one in KIT.sensors]
@@ -48,33 +50,45 @@ def dead(
     return tuple(held(scenario_blocks(SECONDS), [NAMES.index(name) for name in names], value, *between_s))
 
 
-def shown(way: str, folder: Path, *names: str, value: float = np.nan) -> tuple[LatestData, Sampled]:
-    """Data held by a monitor, or read from its recording."""
-    stream = dead(*names, value=value)
-    if way != "recorded":
-        monitor = MachineMonitor(install(KIT, None))
-        for block in stream:
-            monitor.step(block)
-        held = held_now(monitor.window, monitor.health(), monitor.blocks)
-        held = latest_from_bytes(latest_to_bytes(held)) if way == "of another process" else held
-        return held, Held(KIT, held.blocks)
+@cache
+def evaluated(*names: str, **how: Any) -> tuple[MachineMonitor, list[Report]]:
+    """A monitor after the stream of `dead`, and its reports."""
+    monitor = MachineMonitor(install(KIT, None))
+    return monitor, feed(monitor, dead(*names, **how))[0]
+
+
+def held_by(monitor: MachineMonitor) -> LatestData:
+    return held_now(monitor.window, monitor.health(), monitor.blocks)
+
+
+def read_from(folder: Path, stream: Sequence[SampleBlock], report: Report | None = None) -> tuple[LatestData, Sampled]:
+    """A recording and its latest window."""
     data = recorded(recording(folder / "made.mcap", stream, KIT))
     lagged = evaluator_for(Installed(KIT)).needs_lags
-    return recorded_window(data.source, KIT, "demo/lab", None, None, lagged=lagged), data
+    return recorded_window(data.source, KIT, "demo/lab", None, report, lagged=lagged), data
+
+
+def shown(way: str, folder: Path, *names: str, **how: Any) -> tuple[LatestData, Sampled]:
+    """Data held by a monitor, or read from its recording."""
+    if way == "recorded":
+        return read_from(folder, dead(*names, **how))
+    data = held_by(evaluated(*names, **how)[0])
+    data = latest_from_bytes(latest_to_bytes(data)) if way == "of another process" else data
+    return data, Held(KIT, data.blocks)
 
 
 SENT_AS_NAN = "no data of z1: sent as NaN, not connected"
 
 
 @pytest.mark.parametrize(
-    ("way", "value", "said"),
+    ("way", "how", "said"),
     [
-        *((way, np.nan, SENT_AS_NAN) for way in ("live", "of another process", "recorded")),
-        *((way, 100.0, "z1: repeated the value 100 µm") for way in ("live", "recorded")),
+        *((way, {}, SENT_AS_NAN) for way in ("live", "of another process", "recorded")),
+        *((way, {"value": 100.0}, "z1: repeated the value 100 µm") for way in ("live", "recorded")),
     ],
 )
-def test_a_dead_or_stuck_channel_is_shown_as_no_data(way: str, value: float, said: str, tmp_path: Path) -> None:
-    data, samples = shown(way, tmp_path, "z1", value=value)
+def test_a_dead_or_stuck_channel_is_shown_as_no_data(way: str, how: Any, said: str, tmp_path: Path) -> None:
+    data, samples = shown(way, tmp_path, "z1", **how)
     made = snapshots_of(KIT)
     spectra, correlations = spectrum_snapshot(made, data), correlation_snapshot(made, data)
     orbits = orbit_snapshot(made, data, 4)
@@ -101,8 +115,7 @@ def test_a_dead_or_stuck_channel_is_shown_as_no_data(way: str, value: float, sai
 
 
 def test_a_stuck_channel_has_no_levels() -> None:
-    monitor = MachineMonitor(install(KIT, None))
-    reports = [report for block in dead("z1", value=100.0) for report in monitor.step(block).windows]
+    _, reports = evaluated("z1", value=100.0)
     assert reports[-1].filled == 1
     for report in reports:
         levels = {one.channel: one for one in report.levels}
@@ -112,21 +125,21 @@ def test_a_stuck_channel_has_no_levels() -> None:
 
 
 @pytest.mark.parametrize("way", ["live", "recorded"])
-def test_with_a_shaft_angle_that_stopped_a_machine_has_no_speed(way: str, tmp_path: Path) -> None:
-    stream = dead("theta", between_s=(20.0, SECONDS), value=1.0)
-    if way == "live":
-        monitor = MachineMonitor(install(KIT, None))
-        for block in stream:
-            monitor.step(block)
-        data = held_now(monitor.window, monitor.health(), monitor.blocks)
-    else:
-        source = recorded(recording(tmp_path / "made.mcap", stream, KIT)).source
-        lagged = evaluator_for(Installed(KIT)).needs_lags
-        data = recorded_window(source, KIT, "demo/lab", None, None, lagged=lagged)
-    orbits, spectra = orbit_snapshot(snapshots_of(KIT), data), spectrum_snapshot(snapshots_of(KIT), data)
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [({}, "no data of theta"), ({"between_s": (20.0, SECONDS), "value": 1.0}, "theta: the shaft angle stood still")],
+    ids=["missing", "stopped"],
+)
+def test_without_a_turning_angle_a_machine_has_no_speed_rather_than_0(
+    way: str, how: Any, said: str, tmp_path: Path
+) -> None:
+    data, samples = shown(way, tmp_path, "theta", **how)
+    orbits, spectra = orbit_snapshot(snapshots_of(KIT), data, 4), spectrum_snapshot(snapshots_of(KIT), data)
     assert (orbits.speed_rad_s, spectra.speed_rad_s, spectra.rotation_hz) == (None, None, None)
     assert [one.ellipse for one in orbits.orbits] == [None, None]
-    assert "theta: the shaft angle stood still" in orbits.reason
+    assert said in orbits.reason
+    if not how:
+        assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
 
 
 def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
@@ -134,7 +147,7 @@ def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
     for block in scenario_blocks(SECONDS):
         gap = np.full((len(block.samples), 1), np.nan, np.float32)
         monitor.step(replace(block, samples=np.hstack([block.samples.astype(np.float32), gap])))
-    spectra = spectrum_snapshot(snapshots_of(RIG), held_now(monitor.window, monitor.health(), monitor.blocks))
+    spectra = spectrum_snapshot(snapshots_of(RIG), held_by(monitor))
     assert spectra.reason == "no data of DE-H: sent as NaN, not connected"
     assert (spectra.theory.nominal_reason, spectra.theory.estimated_reason) == ("", "")
     assert {one.nominal is not None for one in spectra.densities} == {True}
@@ -142,9 +155,7 @@ def test_a_dead_casing_sensor_does_not_hide_theory() -> None:
 
 def past(**how: Any) -> Past:
     """The history of a machine whose probe z1 dies, see `dead`."""
-    monitor = MachineMonitor(install(KIT, None))
-    reports = tuple(report for block in dead("z1", **how) for report in monitor.step(block).windows)
-    return Past(KIT, KIT.title, "the history", reports, ())
+    return Past(KIT, KIT.title, "the history", tuple(evaluated("z1", **how)[1]), ())
 
 
 def test_plots_of_the_history_show_the_other_sensors() -> None:
@@ -174,21 +185,8 @@ def test_plots_of_the_history_go_on_when_a_sensor_dies() -> None:
         figure.canvas.draw()
 
 
-@pytest.mark.parametrize("way", ["live", "recorded"])
-def test_without_its_angle_a_machine_has_no_speed_rather_than_0(way: str, tmp_path: Path) -> None:
-    data, samples = shown(way, tmp_path, "theta")
-    orbits = orbit_snapshot(snapshots_of(KIT), data, 4)
-    assert orbits.speed_rad_s is None
-    assert [one.ellipse for one in orbits.orbits] == [None, None]
-    assert "no data of theta" in orbits.reason
-    assert waveform_snapshot(samples, samples.channels(["y1"]), 4, None).speed_rad_s is None
-
-
-def test_plots_begin_where_a_lost_angle_returns() -> None:
-    monitor = MachineMonitor(install(KIT, None))
-    for block in dead("theta", between_s=(22.0, 23.0)):
-        monitor.step(block)
-    samples = Held(KIT, monitor.blocks)
+def test_plots_begin_where_a_lost_angle_returns(tmp_path: Path) -> None:
+    _, samples = shown("live", tmp_path, "theta", between_s=(22.0, 23.0))
     assert samples.from_ns == START_NS + 23 * 10**9
     wave = waveform_snapshot(samples, samples.channels(["y1"]), 4, None)
     assert wave.revolutions == 4
@@ -197,15 +195,10 @@ def test_plots_begin_where_a_lost_angle_returns() -> None:
 
 
 def test_a_recorded_window_with_a_missing_channel_is_shown_as_live(tmp_path: Path) -> None:
-    blocks, monitor = dead("z1", between_s=(12.0, 13.0)), MachineMonitor(install(KIT, None))
-    for block in blocks:
-        monitor.step(block)
-    live = held_now(monitor.window, monitor.health(), monitor.blocks)
-    source = recorded(recording(tmp_path / "made.mcap", blocks, KIT)).source
-    lagged = evaluator_for(Installed(KIT)).needs_lags
-    data = recorded_window(source, KIT, "demo/lab", None, monitor.health().latest, lagged=lagged)
-    now, then = (spectrum_snapshot(snapshots_of(KIT), one) for one in (live, data))
-    assert now.reason == then.reason == "no data of z1: sent as NaN, not connected"
+    monitor, reports = evaluated("z1", between_s=(12.0, 13.0))
+    data, _ = read_from(tmp_path, dead("z1", between_s=(12.0, 13.0)), reports[-1])
+    now, then = (spectrum_snapshot(snapshots_of(KIT), one) for one in (held_by(monitor), data))
+    assert now.reason == then.reason == SENT_AS_NAN
     for one, other in zip(now.densities, then.densities, strict=True):
         assert (one.rms is None) == (other.rms is None) == (one.channel == "z1")
         assert one.rms is None or one.rms == pytest.approx(other.rms, rel=1e-4)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx
 import httpx_sse
 import numpy as np
 import pytest
@@ -18,9 +19,7 @@ import pytest
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
-from rotorwatch.records.levels import LevelLimits
 from service.access.scopes import Scope
-from service.analysis.overview import overview
 from service.delivery import event_feed
 from service.delivery.event_feed import CursorError, EventFeed, cursor_text, parsed_cursor
 from service.history.records import StoreError
@@ -31,7 +30,6 @@ from service.settings.service import MachineEntry
 from service.stream.monitored import Monitored
 from tests.service.rig.live import OPEN, endpoint, settings, until
 from tests.service.rig.monitored import client, fed, problem, token
-from tests.sure import sure
 
 EVENTS = "/api/v1/events"
 LAB, HEAVY = "demo/lab", "demo/heavy"
@@ -248,46 +246,6 @@ def test_full_health_of_some_machines_and_overviews_of_others(shared: Runtime) -
 
 
 @pytest.mark.parametrize(
-    ("alarm", "settled", "vibration", "expected"),
-    [
-        ("k_by", False, 1.0, {"k_by"}),  # the subject of a raised alarm, however near others are
-        ("level:y1", False, 1.0, {"y1"}),
-        ("", False, 1.0, {"c_by"}),  # 3 % where 2 % is detectable, against 25 % of 30 %, and 1.93 of 2.8
-        ("", True, 1.0, {"k_by"}),  # c_by is not read
-        ("", True, 2.5, {"z1"}),
-        ("stream-lost", False, 3.0, {"z1"}),  # beyond its limit
-    ],
-)
-def test_an_overview_keeps_what_matters_most(alarm: str, settled: bool, vibration: float, expected: set[str]) -> None:
-    health = Health.model_validate(example(Health))
-    report, raised = sure(health.report), health.alarms[0]
-    one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
-    read = one.model_copy(update={"name": "c_by", "relative_change": 0.03})
-    level = level.model_copy(update={"channel": "y1", "velocity": 1.0})
-    limit = LevelLimits(measure="velocity", alert=2.8, source="", state="alert" if vibration > 2.8 else "normal")
-    report = report.model_copy(
-        update={
-            "parameters": (one, read.model_copy(update={"relative_change": None})),
-            "detectable": tuple(
-                seen.model_copy(update={"name": name, "loss": -least, "gain": least})
-                for name, least in (("k_by", 0.3), ("c_by", 0.02))
-            ),
-            "verdict": sure(report.verdict).model_copy(update={"settled": settled, "current": (one, read)}),
-            "levels": (level, level.model_copy(update={"channel": "z1", "velocity": vibration, "limits": (limit,)})),
-        }
-    )
-    alarms = (raised.model_copy(update={"name": alarm}),) if alarm else ()
-    found = overview(health.model_copy(update={"report": report, "alarms": alarms}))
-    told = sure(found.report)
-    assert told.verdict is not None
-    assert {part.name for part in told.parameters} | {part.channel for part in told.levels} == expected
-    assert [part.name for part in told.detectable] == [part.name for part in told.verdict.current]
-    assert {part.name for part in told.verdict.current} <= expected
-    assert (told.opinions, told.equations, told.verdict.candidates) == ((), (), ())
-    assert (found.state, found.alarms, told.end_ns) == (health.state, alarms, report.end_ns)
-
-
-@pytest.mark.parametrize(
     ("query", "header", "status", "text"),
     [
         ("?detail=all", "", 422, "detail: expected one of whole, overview (found 'all')"),
@@ -332,22 +290,30 @@ def test_a_stalled_reader_does_not_hold_up_others(shared: Runtime) -> None:
         assert [event.data for event in itertools.islice(alarms, first + 201)] == log(lab)
 
 
-def test_streams_per_caller_are_limited_and_freed_on_close() -> None:
-    limits = LimitSettings(requests_per_minute=1_000_000, streams_per_caller=2)
-    with monitor(AccessSettings(open_on_loopback=True, limits=limits)) as runtime, client(runtime) as http:
-        with reading(runtime) as one, reading(runtime) as two:
-            one.next("start")
-            two.next("start")
-            answer = http.get(EVENTS)
-            assert "2 of your event streams are open" in problem(answer, 429).detail
-            assert int(answer.headers["retry-after"]) > 0
-            problem(http.get(f"{EVENTS}?machine=demo/pump"), 429)
+def test_streams_are_limited_per_caller_and_in_total_and_freed_on_close() -> None:
+    limits = LimitSettings(requests_per_minute=1_000_000, streams_per_caller=2, streams=3)
+    with monitor(AccessSettings(limits=limits)) as runtime:
+        one, other = (token(runtime, Scope.READ, name=name) for name in ("one", "other"))
+        with client(runtime, one) as http, client(runtime, other) as late:
 
-        def admitted() -> bool:
-            with httpx_sse.connect_sse(http, "GET", EVENTS) as source:
-                return source.response.status_code == 200
+            def refused(by: httpx.Client, query: str = "") -> str:
+                with by.stream("GET", EVENTS + query) as answer:
+                    assert answer.status_code == 429  # or it would have no end
+                    assert int(answer.headers["retry-after"]) > 0
+                    answer.read()
+                return problem(answer, 429).detail
 
-        until(admitted, "seat")
+            with reading(runtime, text=one), reading(runtime, text=one):
+                assert "2 of your event streams are open" in refused(http)
+                assert "2 of your event streams are open" in refused(http, "?machine=demo/pump")
+                with reading(runtime, text=other):
+                    assert "the most this service allows" in refused(late)
+
+            def admitted() -> bool:
+                with httpx_sse.connect_sse(http, "GET", EVENTS) as source:
+                    return source.response.status_code == 200
+
+            until(admitted, "seat")
 
 
 def test_streams_end_when_the_service_stops(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,21 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.wire import decode_block
-from rotorwatch.records.replays import ReplayLine, ReplayProgress
+from rotorwatch.records.replays import ReplayProgress
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall
-from service.commands.replay import summary_lines
-from service.commands.rotorwatch import app
 from service.recordings.replay.player import Control, PlayPlan, play
 from service.recordings.replay.source import RecordingSource, data_start_ns
 from tests.service.rig.live import LAB, START_NS, scenario_blocks
 from tests.service.rig.replaying import hurried, recording, split, write
-from tests.sure import sure
 
 S = 10**9
 
@@ -123,35 +119,6 @@ def test_spectra_are_of_the_latest_data_and_of_the_later_of_two_runs(
     assert found.averages == (averages or found.averages)
     fall = read_waterfall(stream, stream.chosen(())[0], hop_s, 0.5, "amplitude")
     assert ((fall.start_ns - START_NS) / S).tolist() == list(starts_s)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["orbit", pytest.param("spectrum", marks=pytest.mark.long), pytest.param("waterfall", marks=pytest.mark.long)],
-)
-def test_plots_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
-    where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
-    options = ("--size", "4x3") if kind == "orbit" else ("--window", "4")
-    for path, out in ((slow, tmp_path / "slow.svg"), (quick, tmp_path / "quick.svg")):
-        found = CliRunner().invoke(app, ["plot", kind, str(path), "--out", str(out), *where, *options])
-        assert found.exit_code == 0, found.output
-    assert (tmp_path / "slow.svg").read_bytes() == (tmp_path / "quick.svg").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("options", "count"),
-    [(("--from", "12", "--to", "2026-01-01T00:00:15Z"), 30), (("--from", "39", "--to", "4000"), 10)],
-)
-def test_a_replay_is_limited_by_data_times(quick: Path, tmp_path: Path, options: tuple[str, ...], count: int) -> None:
-    out = tmp_path / "lines.jsonl"
-    found = CliRunner().invoke(
-        app, ["replay", str(quick), "--offline", *options, "--out", str(out), "--progress", "json"]
-    )
-    assert found.exit_code == 0, found.output
-    lines = [ReplayLine.model_validate_json(line) for line in found.stdout.splitlines()]
-    summary, progress = sure(lines[-1].summary), sure(lines[-2].progress)
-    assert (summary.blocks, progress.fraction) == (count, 1.0), list(summary_lines(summary))
-    assert abs(progress.position_ns - START_NS - (15 if count == 30 else 40) * S) <= 1
 
 
 class Timed(Control):

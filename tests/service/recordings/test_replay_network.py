@@ -1,4 +1,4 @@
-"""What a replay publishes, under which keys, and that it never mixes with a live machine."""
+"""What a replay publishes, under which keys, and that it never mixes with or disturbs a live machine."""
 
 import json
 import threading
@@ -9,18 +9,37 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from models.alarm_names import STREAM_LOST
+from models.commissioning.commissioned import install
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, read_recording
+from rotorwatch.records.replays import OfflineSummary
+from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.player import Control
 from service.recordings.replay.source import RecordingSource
+from service.runtime.runtime import running
 from service.stream.inbox import RawBlock
 from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
-from service.stream.transport import Link, MachineCallbacks, MachineLink, route
+from service.stream.transport import Link, MachineCallbacks, MachineLink, TopicMessage, follow, route
+from service.stream.worker import MachineWorker
+from simulator.scenario import parse_fault
 from tests.loopback import session_of
-from tests.service.rig.live import LAB, endpoint, ignore, no_events, scenario_blocks, until
-from tests.service.rig.replaying import recording, write
+from tests.service.rig.live import (
+    LAB,
+    endpoint,
+    ignore,
+    no_events,
+    scenario_blocks,
+    send,
+    service,
+    settings,
+    until,
+    worker_of,
+)
+from tests.service.rig.replaying import digest_of, lines_of, recording, write
 
 Heard = list[tuple[str, bytes, bytes, str]]
+BLOCKS = 700
 
 
 def session(listen: str, namespace: str = "") -> zenoh.Session:
@@ -157,3 +176,61 @@ def test_a_monitor_started_during_a_replay_on_original_keys_takes_no_block(sourc
         late.close()
         other.close()
     assert taken == []
+
+
+def offline(file: Path) -> tuple[OfflineSummary, list[str]]:
+    lines: list[str] = []
+    source = RecordingSource([file])
+    run = OfflineReplay(source, source.machine(), install(LAB, "lab"), lines.append)
+    return run.run(), lines
+
+
+@contextmanager
+def monitor_in(namespace: str, link: LinkSettings) -> Iterator[MachineWorker]:
+    apart = link.model_copy(update={"namespace": namespace})
+    with running(settings(endpoint(), bundle="lab", bound=2000, link=apart)) as runtime:
+        yield worker_of(runtime)
+
+
+def test_a_replay_does_not_disturb_a_live_monitor(tmp_path: Path) -> None:
+    """A healthy machine live, and on the same network the replay of its fault with a second monitor."""
+    faulty = recording(tmp_path / "faulty.mcap", scenario_blocks(BLOCKS / 10, parse_fault("c_bz=0.5@0")))
+    expected, _ = offline(faulty)
+    assert (expected.windows, expected.alarms, expected.raised) == (13, 1, ("c_bz",))
+    assert (expected.blocks, expected.refused_blocks, expected.stopped) == (BLOCKS, {}, False)
+    assert expected.data_s == pytest.approx(BLOCKS / 10)
+    assert expected.descriptor_differences == ()
+    healthy = scenario_blocks(BLOCKS / 10)
+    undisturbed, lines = offline(recording(tmp_path / "healthy.mcap", healthy))
+    assert undisturbed.alarms == 0
+    address, source = endpoint(), RecordingSource([faulty])
+    heard: list[TopicMessage] = []
+    client = LinkSettings(mode="client", connect=(address,))
+    with (
+        service(address, bundle="lab", bound=2000) as (_, live),
+        monitor_in("replay/x", client) as replayed,
+        follow(client, "demo/lab", ("alarm_event", "report"), heard.append),
+    ):
+        paced = plan(source, address, "replay/x", pace=30.0, wait_for_subscriber_s=20.0)
+        thread = threading.Thread(target=replay_to_network, args=(source, paced, Control()))
+        thread.start()
+        until(lambda: replayed.health().quality.accepted_blocks > 0, "replayed blocks")
+        assert not live.health().stream.publisher_alive
+        assert live.health().quality.accepted_blocks == 0
+        send(address, healthy)
+        thread.join()
+        until(lambda: live.health().quality.accepted_blocks == BLOCKS, "live blocks")
+        until(lambda: replayed.health().quality.accepted_blocks == BLOCKS, "replayed blocks")
+        until(lambda: len(heard) >= undisturbed.windows, "live reports")
+        health, elsewhere = live.health(), replayed.health()
+        said, digests = lines_of(live), (digest_of(live), digest_of(replayed))
+    assert health.quality.refused_blocks == elsewhere.quality.refused_blocks == {}
+    assert elsewhere.stream.descriptor_mismatch == ()
+    assert health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
+    # The live machine may go silent while the replay is still running; no other alarm is allowed.
+    assert {alarm.name for alarm in health.alarms} <= {STREAM_LOST}
+    assert said == lines
+    assert digests == (undisturbed.sha256, expected.sha256)  # the replayed monitor did raise its alarm
+    reports = [message for message in heard if message.key == LAB.keys.report]
+    assert len(reports) == undisturbed.windows
+    assert all(STREAM_LOST in message.text for message in heard if message not in reports)

@@ -1,11 +1,10 @@
 """A small application with access control, a real server and a real store, for the tests of access."""
 
-import asyncio
 import base64
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Annotated, Any
 import httpx
 import uvicorn
 from fastapi import APIRouter, FastAPI, Request
-from fastapi.responses import HTMLResponse, StreamingResponse
+from fastapi.responses import HTMLResponse
 from pydantic import BaseModel
 
 from rotorwatch.records.history import AuditRecord
@@ -134,17 +133,6 @@ def application(guard: Guard, done: list[str]) -> FastAPI:
     def forgotten_too() -> str:
         done.append("forgotten")
         return "forgotten"
-
-    @app.get("/events", dependencies=[guard.stream])
-    async def events() -> StreamingResponse:
-        async def pieces() -> AsyncIterator[str]:
-            number = 0
-            while True:
-                yield f"data: {number}\n\n"
-                number += 1
-                await asyncio.sleep(0.02)
-
-        return StreamingResponse(pieces(), media_type="text/event-stream")
 
     return app
 

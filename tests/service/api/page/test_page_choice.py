@@ -83,30 +83,46 @@ def named(alarm: Alarm, name: str) -> Alarm:
     )
 
 
+Found = tuple[Health, Report, dict[str, object], dict[str, object]]
+
+
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[str, object], dict[str, object]]]:
-    """What the page finds worst in each full health and in its overview."""
+def found(tmp_path_factory: pytest.TempPathFactory) -> list[Found]:
+    """Each full health, the report in its overview, and what the page finds worst in either."""
     folder = tmp_path_factory.mktemp("deno")
     script = folder / "ask.js"
     script.write_text(_ASKED.replace("STATES", STATES.as_uri()))
     all_of_them = list(healths())
-    told = [one for health in all_of_them for one in (health, overview(health))]
+    briefs = [overview(health) for health in all_of_them]
+    told = [one for both in zip(all_of_them, briefs, strict=True) for one in both]
     done = run_deno(folder, "run", str(script), given="[" + ",".join(one.model_dump_json() for one in told) + "]")
     assert done.returncode == 0, done.stderr
     answers = json.loads(done.stdout)
-    return list(zip(all_of_them, answers[::2], answers[1::2], strict=True))
+    reports = [sure(one.report) for one in briefs]
+    return list(zip(all_of_them, reports, answers[::2], answers[1::2], strict=True))
 
 
-def test_the_page_agrees_with_the_overview(found: list[tuple[Health, dict[str, object], dict[str, object]]]) -> None:
+def test_the_page_agrees_with_the_overview(found: list[Found]) -> None:
     assert len(found) > 6000
-    different = [(whole, brief) for _, whole, brief in found if whole != brief]
+    different = [(whole, brief) for *_, whole, brief in found if whole != brief]
     assert not different, different[:3]
 
 
-def test_the_page_and_the_service_agree_on_nearness_to_limits(
-    found: list[tuple[Health, dict[str, object], dict[str, object]]],
-) -> None:
-    calm = [(health, whole) for health, whole, _ in found if not health.alarms]
+def test_an_overview_keeps_only_what_alarms_are_about_or_what_is_nearest_to_its_limit(found: list[Found]) -> None:
+    for health, brief, *_ in found:
+        near, expected = nearness(sure(health.report)), {alarm.name for alarm in health.alarms}
+        if not expected & near.keys():
+            expected = {max(near, key=near.__getitem__)}
+        parameters = {one.name for one in brief.parameters}
+        assert parameters | {f"level:{one.channel}" for one in brief.levels} == expected - {"stream-lost"}
+        assert {one.name for one in sure(brief.verdict).current} == parameters
+        assert {one.name for one in brief.detectable} <= parameters
+    brief = sure(overview(Health.model_validate(example(Health))).report)
+    assert (brief.opinions, brief.equations, sure(brief.verdict).candidates) == ((), (), ())
+
+
+def test_the_page_and_the_service_agree_on_nearness_to_limits(found: list[Found]) -> None:
+    calm = [(health, whole) for health, _, whole, _ in found if not health.alarms]
     assert len(calm) > 1000
     for health, whole in calm:
         near = nearness(sure(health.report))
