@@ -1,4 +1,4 @@
-"""Who is let in over HTTP and who is refused: a real server, a real store."""
+"""Who is let in over HTTP, by token or signed in with a browser, and who is refused: a real server, a real store."""
 
 import base64
 import hmac
@@ -8,14 +8,17 @@ import httpx
 import pytest
 from fastapi import FastAPI, WebSocket
 
+from service.access.credentials import COOKIE
 from service.access.guard import AccessError
 from service.access.scopes import Scope
-from service.settings.access import AccessSettings
+from service.settings.access import AccessSettings, LimitSettings
 from tests.service.rig.guarded import JSON, Guarded, application, basic, guarded, problem, served
 
 READ, OPERATE, CONFIGURE = Scope
 DAY_NS = 86_400 * 10**9
 ASKED = 'Bearer realm="rotorwatch"'
+SESSION = "/api/v1/session"
+BODY = {"reason": "known"}
 
 
 def test_a_wrong_expired_or_revoked_token_gets_the_same_answer(monitor: Guarded) -> None:
@@ -208,3 +211,67 @@ def test_open_on_loopback_every_caller_is_anonymous_and_audited(tmp_path: Path) 
 def test_only_a_configured_proxy_names_the_caller(tmp_path: Path, proxies: tuple[str, ...], address: str) -> None:
     with guarded(tmp_path, AccessSettings(proxies=proxies)) as monitor, monitor.client(monitor.token(READ)) as client:
         assert client.get("/health", headers={"x-forwarded-for": "10.1.2.3"}).json()["address"] == address
+
+
+def signed_in(monitor: Guarded, client: httpx.Client, token: str) -> httpx.Response:
+    return client.post(SESSION, json={}, headers={"authorization": f"Bearer {token}", "origin": monitor.url})
+
+
+def test_a_session_reads_and_operates_until_signing_out(monitor: Guarded) -> None:
+    token = monitor.token(READ, OPERATE)
+    with monitor.client() as client:
+        answer = signed_in(monitor, client, token)
+        assert answer.json() == {"name": "ops", "scopes": ["read", "operate"]}
+        attributes = {one.strip().lower() for one in answer.headers["set-cookie"].split(";")[1:]}
+        assert {"httponly", "samesite=strict", "path=/"} <= attributes
+        assert not any(one.startswith(("max-age", "expires", "domain")) for one in attributes)
+        assert client.get("/health").json()["name"] == "ops"
+        assert client.post("/alarms/k_by/shelve", json=BODY, headers={"origin": monitor.url}).json() == "shelved"
+        assert client.delete(SESSION, headers={"origin": monitor.url}).json() == {"name": "", "scopes": []}
+        assert COOKIE not in client.cookies
+        problem(client.get("/health"), 401)
+    assert monitor.done == ["shelve k_by ops"]
+    logged = {(entry.method, entry.actor) for entry in monitor.entries() if entry.path == SESSION}
+    assert logged == {("POST", "ops"), ("DELETE", "ops")}
+
+
+def test_the_cookie_changes_nothing_without_the_services_own_origin(monitor: Guarded) -> None:
+    token = monitor.token(READ, OPERATE)
+    with monitor.client() as client:
+        signed_in(monitor, client, token)
+        here, elsewhere = {"origin": monitor.url}, {"origin": "https://elsewhere.example"}
+        for headers in ({}, elsewhere, {"origin": "null"}, here | {"sec-fetch-site": "cross-site"}):
+            assert problem(client.post("/alarms/k_by/shelve", json=BODY, headers=headers), 403)
+            assert problem(client.delete(SESSION, headers=headers), 403)
+        assert client.get("/health", headers=elsewhere).status_code == 200  # they cannot read the response
+        problem(client.post("/alarms/k_by/shelve", content=b"reason=known", headers=here), 415)
+    assert not monitor.done
+
+
+def test_a_wrong_token_sets_no_cookie_and_a_revoked_one_ends_the_session(monitor: Guarded) -> None:
+    record, token = monitor.issue(READ)
+    with monitor.client() as client:
+        problem(signed_in(monitor, client, token[:-1]), 401)
+        problem(client.post(SESSION, json={}), 401)
+        assert not client.cookies
+        signed_in(monitor, client, token)
+        monitor.store.tokens.revoke(record.token_id, 1)
+        assert "no longer signed in" in problem(client.get("/health"), 401)
+        # A token in the header takes precedence over the cookie.
+        other = monitor.token(READ, name="other")
+        assert client.get("/health", headers={"authorization": f"Bearer {other}"}).json()["name"] == "other"
+
+
+def test_wrong_cookies_count_as_failed_attempts(tmp_path: Path) -> None:
+    with (
+        guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=2))) as monitor,
+        monitor.client() as client,
+    ):
+        client.cookies.set(COOKIE, "rw_nothing")
+        assert [client.get("/health").status_code for _ in range(4)] == [401, 401, 429, 429]
+
+
+def test_no_cookie_is_set_where_no_token_is_needed(tmp_path: Path) -> None:
+    with guarded(tmp_path, AccessSettings(open_on_loopback=True)) as monitor, monitor.client() as client:
+        assert client.post(SESSION, json={}).json()["name"] == "anonymous"
+        assert not client.cookies

@@ -28,7 +28,7 @@ from tests.service.rig.monitored import PLACE, answered, client, problem
 from tests.service.rig.replaying import S, recording
 from tests.sure import sure
 
-SECONDS, FAULT_S = 60.0, 25.0
+SECONDS, FAULT_S = 55.0, 25.0
 GAP = range(303, 306)
 NAME = "20260101T000000Z.mcap"
 REPLAYS = "/api/v1/replays"

@@ -20,6 +20,7 @@ from service.recordings.catalogue import Catalogue
 from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, RecordingSettings, ReplaySettings, ServiceSettings
 from simulator.scenario import parse_fault
+from tests.service.commands.test_demo import children_of
 from tests.service.rig import monitored
 from tests.service.rig.live import START_NS, endpoint, scenario_blocks, settings, until
 from tests.service.rig.monitored import problem
@@ -312,18 +313,5 @@ def test_the_service_stops_its_replays_and_deletes_old_results(directory: Path) 
         jobs = runtime.replays.jobs
     stopped = sure(jobs.find(second.id))
     assert stopped.view.state == "stopped"
-    assert not processes_with(second.id)
-
-
-def processes_with(text: str) -> list[str]:
-    """Command lines of processes on this computer that contain a text."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                line = (entry / "cmdline").read_bytes()
-            except OSError:
-                continue
-            if text.encode() in line:
-                found.append(line.decode(errors="replace"))
-    return found
+    left = [Path(f"/proc/{one}/cmdline").read_bytes() for one in children_of(os.getpid())]
+    assert not any(second.id.encode() in line for line in left)

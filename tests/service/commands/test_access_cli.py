@@ -99,10 +99,9 @@ def test_narrow_terminals_show_all_columns(config: str, monkeypatch: pytest.Monk
     assert line.endswith(f"create-token: {token_id}, a dashboard beside the door, {' '.join(Scope)}")
 
 
-def test_token_commands_refuse_a_history_in_memory(tmp_path: Path) -> None:
-    path = tmp_path / "plant.toml"
-    path.write_text('[history]\nurl = "sqlite:///:memory:"\n', encoding="utf-8")
-    result = run("token", "list", "--config", str(path))
+def test_token_commands_refuse_a_history_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROTORWATCH_HISTORY__URL", "sqlite:///:memory:")
+    result = run("token", "list")
     assert result.exit_code == 2
     assert "in memory" in result.stderr
 

@@ -173,16 +173,6 @@ def test_a_trend_of_many_windows_uses_buckets(store: Store, clock: Clock, monkey
     assert few[0].start_ns == written.ends[0]
 
 
-def test_non_finite_readings_are_kept_but_left_out_of_means(store: Store) -> None:
-    lab = store.machine("demo", "lab")
-    for number, value in enumerate((float("inf"), 1.0, float("-inf"))):
-        assert lab.commit(Step(readings=(StoredReading(T0 + number, "misfit", "misfit", value, None),)))
-    assert len(lab.readings(quantity="misfit", name="misfit")) == 3
-    store.reduction.run(T0 + 1000 * DAY)
-    (bucket,) = lab.downsampled(quantity="misfit")
-    assert (bucket.count, bucket.mean) == (1, 1.0)
-
-
 def test_everything_expires_except_alarm_events_and_audit_entries(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(Step(events=(alarm_event(0),)))

@@ -77,10 +77,13 @@ def test_windows_are_added_to_a_bucket_when_the_next_one_begins(store: Store, mo
     commit(lab, 40, 1800, 1900, 3000)
     assert stored(store) == ([0, 1, 3], 9)
     assert counts(lab) == [5, 2, 2, 1]
-    commit(lab, 3001, value=math.inf)
+    commit(lab, 3001, value=math.inf)  # is kept, but part of no mean
     commit(lab, 3600)
     assert stored(store) == ([0, 1, 3, 5], 11)
     assert (counts(lab), counts(lab, points=1)) == ([5, 2, 2, 1, 1], [11])
+    assert [one.value for one in lab.readings(quantity="parameter", name="e")] == [1.0] * 10 + [math.inf, 1.0]
+    store.reduction.run(T0 + 1000 * 86_400 * NS)
+    assert (counts(lab), lab.downsampled(quantity="parameter", points=1)[0].mean) == ([5, 2, 2, 1, 1], 1.0)
 
 
 def test_a_trend_begins_with_the_first_reading_and_ends_with_the_newest_window(store: Store) -> None:

@@ -29,7 +29,7 @@ from service.recordings.recorder import Backlog, MachineRecorder
 from service.settings.service import RecordingSettings, ServiceSettings
 from tests.loopback import session_of
 from tests.service.recordings.test_recorder_killed import Sender
-from tests.service.rig.live import LAB, Program, endpoint, feeding, open_session, program, settings, until, worker_of
+from tests.service.rig.live import LAB, endpoint, feeding, open_session, program, settings, until, worker_of
 from tests.sure import sure
 
 KEYS = LAB.keys
@@ -253,18 +253,14 @@ def test_a_write_error_is_reported_and_recording_resumes_without_loss(tmp_path: 
                 send()
             until(lambda: recorder.latest().get("received", 0) >= 180, "all messages")
         assert recorder.stop() == 0
-        check_whole(recorder, tmp_path / "kept", send.sent)
-
-
-def check_whole(recorder: Program, directory: Path, sent: list[tuple[bytes, bytes]]) -> None:
     status = recorder.latest()
     assert (status["lost"], status["dropped"], status["problem"]) == (0, 0, "")
     assert status["failures"] != 0
-    listed = Catalogue(directory).recordings()
+    listed = Catalogue(tmp_path / "kept").recordings()
     assert len(listed) >= 2
     assert [one for one in listed if not one.complete or one.problem] == []
     found = [(m.payload, m.attachment) for one in listed for m in read_recording(one.path, keys=[KEYS.stream])]
-    assert found == sent
+    assert found == send.sent
 
 
 def test_a_full_queue_drops_and_counts_samples_but_keeps_other_messages() -> None:

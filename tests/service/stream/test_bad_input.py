@@ -236,9 +236,8 @@ def test_recordings_of_a_later_version_are_exported_and_plotted(of_later: Path) 
     now, later_on = selected(FIXTURES / VERSIONS[-1] / "recording.mcap"), selected(of_later)
     for table in (stream_table, report_table, alarm_table):
         assert everything(table(later_on)) == everything(table(now))
-    source = RecordingSource([of_later])
-    trend = read_trend(Recorded(source, KEYS, 0, 2**62))
+    reader = Recorded(RecordingSource([of_later]), KEYS, 0, 2**62)
+    trend = read_trend(reader)
     assert trend.origin == "as recorded"
     assert {event.kind for event in trend.alarms} == {EventKind.RAISED}
-    reader = Recorded(source, KEYS, 0, 2**62)
     assert len(reader.descriptor.channels) == 9
