@@ -1,23 +1,10 @@
-"""Values of plots from the newest samples, recordings and the history, against closed forms and over HTTP."""
+"""Values of plots from the newest samples against closed forms; `test_api` has them over HTTP."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import httpx
 import numpy as np
 import pytest
 
 from models.errors import RotorwatchError
 from models.signals.channels import Quantity
-from rotorwatch.records.plots import (
-    CentrelineSeries,
-    FullSpectrumSnapshot,
-    VectorSeries,
-    WaterfallSnapshot,
-    WaveformSnapshot,
-)
-from rotorwatch.records.recordings import RecordingList
-from service.analysis.past import Past
 from service.analysis.recorded import Held, Sampled
 from service.analysis.snapshots.plots import (
     centreline_series,
@@ -26,12 +13,9 @@ from service.analysis.snapshots.plots import (
     waterfall_snapshot,
     waveform_snapshot,
 )
-from service.api import samples
-from service.runtime.runtime import Runtime
 from tests.service.analysis.snapshotting import numbers
 from tests.service.rig.live import LAB, START_NS
-from tests.service.rig.monitored import PLACE, answered, client, faulty, problem
-from tests.service.rig.replaying import S, recording
+from tests.service.rig.replaying import S
 from tests.service.rig.run_up import BLOCKS, CHANNELS, FROM_HZ, LAG, RUNOUT_UM, SECONDS, SHAFT_UM, TO_HZ, angle
 from tests.sure import sure
 
@@ -121,83 +105,6 @@ def test_the_centreline_moves_with_the_mean(data: Sampled) -> None:
     at_s = (np.array(found.times_ns) - START_NS) / S
     assert numbers(bearing.y_um) == pytest.approx(RUNOUT_UM, abs=1)
     assert numbers(bearing.z_um) == pytest.approx(-4 * at_s, abs=1)
-
-
-@pytest.fixture(scope="module")
-def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, Path]]:
-    folder = tmp_path_factory.mktemp("machine")
-    with faulty(folder) as (running, _):
-        yield running, recording(folder / "recordings" / "demo" / "lab" / "run-up.mcap", BLOCKS)
-
-
-@pytest.fixture(scope="module")
-def http(runtime: tuple[Runtime, Path]) -> Iterator[httpx.Client]:
-    with client(runtime[0]) as found:
-        yield found
-
-
-def test_values_come_from_the_requested_source(runtime: tuple[Runtime, Path], http: httpx.Client) -> None:
-    (worker,) = runtime[0].machines()
-    now = answered(http.get(f"{PLACE}/waveforms"), WaveformSnapshot)
-    assert (now.source, now.revolutions) == ("newest samples", 8)
-    assert START_NS + 78 * S - sure(now.end_ns) < S // 10
-    assert [one.channel for one in now.waveforms] == ["y1", "z1", "y2", "z2"]
-    assert answered(http.get(f"{PLACE}/full-spectra"), FullSpectrumSnapshot).averages == 19
-    assert answered(http.get(f"{PLACE}/waterfalls?channel=y2"), WaterfallSnapshot).channel == "y2"
-    steady = answered(http.get(f"{PLACE}/waterfalls?over=speed"), WaterfallSnapshot)
-    assert "need a run-up or coast-down" in steady.reason
-    assert not steady.rows
-
-    past = answered(http.get(f"{PLACE}/vectors?channel=y2"), VectorSeries)
-    assert (past.source, past.revolutions) == ("history", None)
-    assert "1320 rpm" in past.steady
-    reported = {one.end_ns: one for one in Past.of(LAB, worker.history.report_log, None, None, 400).reports}
-    for number, time_ns in enumerate(past.times_ns):
-        (levels,) = (one for one in reported[time_ns].levels if one.channel == "y2")
-        assert past.channels[0].amplitude[number] == pytest.approx(levels.x1, rel=1e-5)
-        assert past.channels[0].phase_lag_deg[number] == pytest.approx(levels.x1_phase_lag_deg, rel=1e-5)
-    later = answered(http.get(f"{PLACE}/vectors", params={"since_ns": past.times_ns[-1]}), VectorSeries)
-    assert later.times_ns == past.times_ns[-1:]
-    never = answered(http.get(f"{PLACE}/centrelines?until_ns=5"), CentrelineSeries)
-    assert (never.places, never.reason) == ((), "demo/lab: no reports in this stretch of time")
-
-    run_up = {"recording": "run-up.mcap"}
-    found = answered(http.get(f"{PLACE}/vectors", params={"channel": "y1", **run_up}), VectorSeries)
-    assert found.source == "recordings"
-    assert numbers(found.channels[0].amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.03)
-    for name, model in (
-        ("waveforms", WaveformSnapshot),
-        ("full-spectra", FullSpectrumSnapshot),
-        ("waterfalls", WaterfallSnapshot),
-        ("centrelines", CentrelineSeries),
-    ):
-        read = answered(http.get(f"{PLACE}/{name}", params=run_up), model)
-        assert read.model_dump()["source"] == "recordings", name
-        assert read.model_dump()["reason"] == "", name
-
-
-def test_impossible_requests_are_refused_or_explained(http: httpx.Client) -> None:
-    listed = answered(http.get("/api/v1/recordings"), RecordingList).recordings
-    (writing,) = (one.id.rsplit("/", 1)[1] for one in listed if not one.complete)
-    assert "run-up.mcap.part" not in writing
-    problem(http.get(f"{PLACE}/vectors", params={"recording": writing}), 422)
-    problem(http.get(f"{PLACE}/vectors?recording=other.mcap"), 404)
-    problem(http.get(f"{PLACE}/vectors?recording=..%2Fpump%2Fx.mcap"), 422)
-    assert "theta" in problem(http.get(f"{PLACE}/waveforms?channel=theta"), 422).detail
-    assert "name a recording" in problem(http.get(f"{PLACE}/vectors?slow_roll_rpm=300"), 422).detail
-    explained = answered(http.get(f"{PLACE}/vectors?order=3"), VectorSeries)
-    assert "are kept of 1x and 2x" in explained.reason
-
-
-def test_recordings_are_read_one_at_a_time_and_bounded(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = f"{PLACE}/waterfalls?recording=run-up.mcap"
-    with monkeypatch.context() as patched:
-        patched.setattr(samples, "_MOST_BYTES", 1000)
-        assert "expected at most" in problem(http.get(path), 422).detail
-    monkeypatch.setattr(samples, "_PATIENCE_S", 0.01)
-    with samples._ONE_AT_A_TIME:
-        assert "for another caller" in problem(http.get(path), 503).detail
-    assert answered(http.get(path), WaterfallSnapshot).rows
 
 
 def test_a_full_spectrum_of_too_few_samples_is_refused() -> None:

@@ -158,7 +158,7 @@ def test_windows_of_a_replay_before_and_after_a_fault_over_http(http: httpx.Clie
     assert healthy.start_ns <= sure(rows.start_ns) < sure(rows.end_ns) <= healthy.end_ns + S // 10
 
 
-def test_windows_of_recordings_and_of_a_paced_replay_over_http(http: httpx.Client, runtime: Runtime) -> None:
+def test_windows_of_recordings_and_of_a_paced_replay_over_http(http: httpx.Client) -> None:
     def spectra(until_ns: int) -> SpectrumSnapshot:
         asked: dict[str, str | int] = {"recording": NAME, "until_ns": until_ns}
         return answered(http.get(f"{PLACE}/spectra", params=asked), SpectrumSnapshot)

@@ -16,15 +16,27 @@ from rotorwatch.records.health import MEASURES, Health
 from rotorwatch.records.history import ReadingList, ReportList
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration
 from rotorwatch.records.monitor import CallerRights
+from rotorwatch.records.plots import (
+    CentrelineSeries,
+    FullSpectrumSnapshot,
+    VectorSeries,
+    WaterfallSnapshot,
+    WaveformSnapshot,
+)
+from rotorwatch.records.recordings import RecordingList
 from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.access.scopes import Scope
+from service.api import samples
 from service.api.app import DescribedApp
 from service.api.routes.page import page_files
 from service.history.records import Step, StoredReading
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
+from tests.service.analysis.snapshotting import numbers
 from tests.service.rig.live import ROOT, START_NS
 from tests.service.rig.monitored import GUARDED, PLACE, answered, client, faulty, fed, problem, token
+from tests.service.rig.replaying import S, recording
+from tests.service.rig.run_up import BLOCKS, SHAFT_UM
 from tests.sure import sure
 
 HOP_NS = 5_000_000_000
@@ -32,7 +44,9 @@ HOP_NS = 5_000_000_000
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker]]:
-    with faulty(tmp_path_factory.mktemp("machine")) as running:
+    folder = tmp_path_factory.mktemp("machine")
+    recording(folder / "recordings" / "demo" / "lab" / "run-up.mcap", BLOCKS)
+    with faulty(folder) as running:
         yield running
 
 
@@ -284,3 +298,61 @@ def test_an_internal_error_gets_500_without_details(
     assert "secret" not in problem(answer, 500).model_dump_json()
     monkeypatch.undo()
     assert http.get(f"{PLACE}/health").status_code == 200
+
+
+def test_values_of_plots_come_from_the_requested_source(http: httpx.Client) -> None:
+    now = answered(http.get(f"{PLACE}/waveforms"), WaveformSnapshot)
+    assert (now.source, now.revolutions) == ("newest samples", 8)
+    assert START_NS + 78 * S - sure(now.end_ns) < S // 10
+    assert [one.channel for one in now.waveforms] == ["y1", "z1", "y2", "z2"]
+    assert answered(http.get(f"{PLACE}/full-spectra"), FullSpectrumSnapshot).averages == 19
+    assert answered(http.get(f"{PLACE}/waterfalls?channel=y2"), WaterfallSnapshot).channel == "y2"
+    steady = answered(http.get(f"{PLACE}/waterfalls?over=speed"), WaterfallSnapshot)
+    assert "need a run-up or coast-down" in steady.reason
+    assert not steady.rows
+
+    past = answered(http.get(f"{PLACE}/vectors?channel=y2"), VectorSeries)
+    assert (past.source, past.revolutions) == ("history", None)
+    assert "1320 rpm" in past.steady
+    later = answered(http.get(f"{PLACE}/vectors", params={"since_ns": past.times_ns[-1]}), VectorSeries)
+    assert later.times_ns == past.times_ns[-1:]
+    never = answered(http.get(f"{PLACE}/centrelines?until_ns=5"), CentrelineSeries)
+    assert (never.places, never.reason) == ((), "demo/lab: no reports in this stretch of time")
+
+    run_up = {"recording": "run-up.mcap"}
+    found = answered(http.get(f"{PLACE}/vectors", params={"channel": "y1", **run_up}), VectorSeries)
+    assert found.source == "recordings"
+    assert numbers(found.channels[0].amplitude) == pytest.approx(2 * SHAFT_UM, rel=0.03)
+    for name, model in (
+        ("waveforms", WaveformSnapshot),
+        ("full-spectra", FullSpectrumSnapshot),
+        ("waterfalls", WaterfallSnapshot),
+        ("centrelines", CentrelineSeries),
+    ):
+        read = answered(http.get(f"{PLACE}/{name}", params=run_up), model)
+        assert read.model_dump()["source"] == "recordings", name
+        assert read.model_dump()["reason"] == "", name
+
+
+def test_impossible_requests_for_plots_are_refused_or_explained(http: httpx.Client) -> None:
+    listed = answered(http.get("/api/v1/recordings"), RecordingList).recordings
+    (writing,) = (one.id.rsplit("/", 1)[1] for one in listed if not one.complete)
+    assert "run-up.mcap.part" not in writing
+    problem(http.get(f"{PLACE}/vectors", params={"recording": writing}), 422)
+    problem(http.get(f"{PLACE}/vectors?recording=other.mcap"), 404)
+    problem(http.get(f"{PLACE}/vectors?recording=..%2Fpump%2Fx.mcap"), 422)
+    assert "theta" in problem(http.get(f"{PLACE}/waveforms?channel=theta"), 422).detail
+    assert "name a recording" in problem(http.get(f"{PLACE}/vectors?slow_roll_rpm=300"), 422).detail
+    explained = answered(http.get(f"{PLACE}/vectors?order=3"), VectorSeries)
+    assert "are kept of 1x and 2x" in explained.reason
+
+
+def test_recordings_are_read_one_at_a_time_and_bounded(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = f"{PLACE}/waterfalls?recording=run-up.mcap"
+    with monkeypatch.context() as patched:
+        patched.setattr(samples, "_MOST_BYTES", 1000)
+        assert "expected at most" in problem(http.get(path), 422).detail
+    monkeypatch.setattr(samples, "_PATIENCE_S", 0.01)
+    with samples._ONE_AT_A_TIME:
+        assert "for another caller" in problem(http.get(path), 503).detail
+    assert answered(http.get(path), WaterfallSnapshot).rows

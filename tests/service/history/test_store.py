@@ -170,7 +170,7 @@ def test_values_no_database_can_store_are_refused_by_name(lab: MachineStore, ste
     assert lab.commit(hop_step(1, events=(alarm_event(0),)))
 
 
-def test_waiting_steps_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_steps_are_committed_together(store: Store) -> None:
     machines = [store.machine("demo", f"m{number}") for number in range(12)]
     commits: list[int] = []
     event.listen(store.database.engine, "commit", lambda connection: commits.append(1))

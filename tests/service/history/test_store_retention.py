@@ -241,7 +241,7 @@ def test_invalid_retention_settings_are_refused(fields: dict[str, float]) -> Non
         Retention.model_validate(fields)
 
 
-def test_status_states_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
+def test_status_states_how_far_back_the_history_goes(store: Store) -> None:
     lab, idle = store.machine("demo", "lab"), store.machine("demo", "idle")
     assert idle.last_sequence == -1
     empty = store.status()

@@ -23,18 +23,9 @@ def foreign(
 ) -> FloatArray:
     """Samples of such a stream in the units of the machine's channels, shape (n_samples, n_channels).
 
-    Parameters
-    ----------
-    machine : Machine
-    kind : str
-        ``sines``: the 1× and one (``two sines``: two) more, of any frequency in the band. ``drift``: noise of density
-        f^-slope in every motion, beside the 1×. ``late copy``: one channel of a healthy machine is another's, later.
-    seed : int
-    duration_s : float
-    slope : float
-        Of the drift.
-    late : int
-        Samples by which the copy is late.
+    ``sines``: the 1× and one (``two sines``: two) more, of any frequency in the band. ``drift``: noise of density
+    f^-slope in every motion, beside the 1×. ``late copy``: one channel of a healthy machine is another's, some samples
+    later.
     """
     if kind == "late copy":
         return late_copy(machine, simulated(machine, seed, duration_s), {"z1": "y1"}, late, seed)

@@ -254,7 +254,7 @@ def test_waiting_blocks_of_the_followed_publisher_come_first() -> None:
     assert [sender_of(one.attachment, one.encoding)[1] for one in order if isinstance(one, RawBlock)] == [3, 3, 2, 2]
 
 
-def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
+def test_a_flood_of_bad_messages_costs_no_good_block() -> None:
     """Ten thousand bad messages for every second of good data, at the pace of the data."""
     address = endpoint()
     with service(address, bound=100) as (_, worker), open_session(address) as session:
