@@ -123,7 +123,7 @@ def kit(tmp_path_factory: pytest.TempPathFactory) -> Installed:
 
 def test_a_skipped_window_is_not_evaluable_and_an_alarm_says_why(kit: Installed) -> None:
     skipped = {START_NS + round(end_s * 1e9) for end_s in (42.5, 47.5)}
-    monitor, stream = MachineMonitor(kit, skipped.__contains__), scenario_blocks(90.0)
+    monitor, stream = MachineMonitor(kit, skipped.__contains__), scenario_blocks(80.0)
     windows, events = feed(monitor, stream[:480])
     for window in windows[-2:]:
         assert (window.skipped, window.state) == (True, HealthState.NOT_EVALUABLE)
@@ -160,7 +160,7 @@ def test_level_alarms_come_as_soon_in_skipped_windows_as_in_others(kit: Installe
 
 
 def test_a_change_is_named_even_if_every_other_window_is_skipped(kit: Installed) -> None:
-    stream = scenario_blocks(90.0, parse_fault("k_by=-0.33@50"))
+    stream = scenario_blocks(80.0, parse_fault("k_by=-0.33@50"))
     hop_ns = round(kit.machine.window.hop_s * 1e9)
     monitor = MachineMonitor(kit, lambda end_ns: (end_ns - START_NS) // hop_ns % 2 == 0)
     _, events = feed(monitor, stream)
@@ -188,12 +188,12 @@ def test_level_growth_beside_a_named_change_is_found_in_skipped_windows(kit: Ins
     )
     gain = np.array([1.7] * 8 + [1.0], np.float32)
     told = {}
-    for block in scenario_blocks(105.0, parse_fault("k_by=-0.15@40")):
+    for block in scenario_blocks(92.0, parse_fault("k_by=-0.15@40")):
         louder = replace(block, samples=block.samples * gain) if block.start_ns >= START_NS + 75 * S else block
         for event in monitor.step(louder).events:
             told[f"{event.kind.value} {event.alarm.name}"] = (event.time_ns - START_NS) / S
     assert told["raised k_by"] < 70
-    assert 75 < told[f"raised {LEVEL}y1"] < 105
+    assert 75 < told[f"raised {LEVEL}y1"]
 
 
 def message(number: int, source: str) -> RawBlock:
