@@ -18,10 +18,12 @@ from models.errors import EstimationError
 from tests.diagnosis.baseline.fe_rotor import OTHER, ROTOR, Excitation, of_states, plan, recorded, simulate
 from tests.sure import sure
 
+USUAL, QUIET = Excitation(), replace(OTHER, level_N=1.0)
+
 
 @cache
-def monitor(**noise: float) -> BaselineDiagnostician:
-    return BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, **noise)))
+def monitor(excitation: Excitation = USUAL) -> BaselineDiagnostician:
+    return BaselineDiagnostician(learn_baseline(recorded(ROTOR, excitation, 1, 3)))
 
 
 def z_of(diagnosis: Diagnosis) -> dict[str, float]:
@@ -92,32 +94,28 @@ def test_parameters_that_cannot_be_read_state_a_reason() -> None:
 
 def test_a_1x_vector_that_no_unbalance_causes_is_unexplained() -> None:
     """An unbalance is one force in both planes: a plane whose sensors are all reversed shows two."""
-    quiet = replace(OTHER, level_N=1.0)
-    reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
-    (window,) = recorded(ROTOR, quiet, 3)
+    (window,) = recorded(ROTOR, QUIET, 3)
     q = sure(window.synchronous).copy()
-    assert not reading.diagnose(window).unexplained
+    assert not monitor(QUIET).diagnose(window).unexplained
     q[[number for number, name in enumerate(window.states) if name.startswith("y")]] *= -1
-    diagnosis = reading.diagnose(replace(window, synchronous=q))
+    diagnosis = monitor(QUIET).diagnose(replace(window, synchronous=q))
     assert "the 1× vibration is not what an unbalance causes" in diagnosis.unexplained
     reasons = {one.name: one.reason for one in diagnosis.parameters}
     assert reasons["e"] == diagnosis.unexplained
     for turned in (2.0, 0.5j, -1.0):  # another unbalance is explained at any angle
-        more = reading.diagnose(replace(window, synchronous=sure(window.synchronous) * turned))
+        more = monitor(QUIET).diagnose(replace(window, synchronous=sure(window.synchronous) * turned))
         assert not more.unexplained
 
 
 @pytest.mark.parametrize("planes", ["y", "yz"])
 def test_signs_reversed_within_the_window_give_no_reading_of_the_unbalance(planes: str) -> None:
     """One hop of reversed signs was taken for a changed unbalance, with full confidence."""
-    quiet = replace(OTHER, level_N=1.0)
-    reading = BaselineDiagnostician(learn_baseline(recorded(ROTOR, quiet, 1, 3)))
-    (window,) = recorded(ROTOR, quiet, 3)
+    (window,) = recorded(ROTOR, QUIET, 3)
     of_plane = [state[0] in planes for state in window.states]
     for hops, factor, unread in ((1, -1.0, True), (4, -1.0, True), (4, 1.0j, False), (4, -2.0, False)):
         vectors = sure(window.hop_synchronous).copy()
         vectors[-hops:, of_plane] *= factor
-        found = reading.diagnose(replace(window, hop_synchronous=vectors))
+        found = monitor(QUIET).diagnose(replace(window, hop_synchronous=vectors))
         assert ("turned by 180° within the window" in found.parameters[-1].reason) == unread, (hops, factor)
 
 
@@ -138,8 +136,7 @@ def test_errors_of_the_unbalance_are_those_of_the_force_however_near_a_resonance
     w = 2 * np.pi * window.frequencies_hz
     moved = 1 / (1 + 0.02j * w / own - (w / own) ** 2)
     window = replace(window, spectrum=np.abs(moved[:, None, None]) ** 2 * np.ones((2, 2)) + 0j)
-    found = rotation_of(window, ("y1", "y2"), [(ROWS[0], left)])
-    assert found is not None
+    found = sure(rotation_of(window, ("y1", "y2"), [(ROWS[0], left)]))
     at_speed = np.array([1 + 0.02j * window.speed_rad_s / own, -((window.speed_rad_s / own) ** 2)])
     force = np.concatenate([at_speed, 1j * at_speed])  # what real and imaginary parts of displacements leave
     for part in (force.real, force.imag):

@@ -129,11 +129,10 @@ def test_the_common_part_is_part_of_the_covariance() -> None:
     monitor = monitor_of(*DISPLACEMENTS)
     (same,) = recorded(ROTOR, OTHER, 73, 1)
     diagnosis = monitor.diagnose(of_states(same, DISPLACEMENTS))
-    assert diagnosis.common is not None
-    assert diagnosis.covariance is not None
-    assert np.all(np.diag(diagnosis.common) > 0)
-    unit = 1 / np.sqrt(np.diag(diagnosis.covariance))
-    assert np.linalg.eigvalsh((diagnosis.covariance - diagnosis.common) * np.outer(unit, unit))[0] > 0
+    common, covariance = sure(diagnosis.common), sure(diagnosis.covariance)
+    assert np.all(np.diag(common) > 0)
+    unit = 1 / np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh((covariance - common) * np.outer(unit, unit))[0] > 0
 
 
 def test_a_plane_without_a_probe_states_so_and_the_other_is_read() -> None:

@@ -16,6 +16,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 from simulator.scenario import Event
+from tests.diagnosis.sensors.test_gain_jumps import of_rotor
 from tests.diagnosis.sensors.test_sensor_checks import (
     DISPLACEMENTS,
     MORE_S,
@@ -268,14 +269,7 @@ def test_a_resonance_near_the_speed_is_no_fault_of_the_angle(wanders: float, res
 def test_a_1x_that_moves_beside_low_resonances_is_no_gain_drift() -> None:
     """It leaks into bins half a hertz off, a twentieth of its frequency; a true drift is still found."""
     soft = {"k_by_N_per_m": 6e3, "k_bz_N_per_m": 7e3, "shaft_E_Pa": 2.6e10, "e_m": 4e-4}
-    lab = load_machine("lab")
-    machine = lab.model_copy(
-        update={
-            "rotor": lab.rotor.model_copy(update=soft),
-            "operation": lab.operation.model_copy(update={"speed_rpm": 490.0}),
-            "window": lab.window.model_copy(update={"segment_s": 2.0}),
-        }
-    )
+    machine = of_rotor(2000.0, 490.0, **soft)
     samples = healthy_samples(machine, 63.0, 3224001, Event(at_s=30.0, ramp_s=5.0, speed_rpm=539.0))
     assert sensor_findings(statistics(machine, samples)) == ()
     samples[100_000:, 6] *= 1.05

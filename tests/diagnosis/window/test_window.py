@@ -1,4 +1,4 @@
-"""Sliding correlations: online equals batch for any splitting; offsets, gaps and the synchronous part."""
+"""Sliding correlations: online equals batch for any splitting, and theory; offsets, gaps and the synchronous part."""
 
 from dataclasses import fields, replace
 from functools import cache
@@ -16,12 +16,17 @@ from models.diagnosis.window.moments import Plan, hop_moments, plan_for
 from models.diagnosis.window.sliding import SlidingWindow
 from models.diagnosis.window.statistics import WindowStatistics
 from models.machine import load_machine
+from models.physics.excitation import expanded_A, expanded_B
+from models.physics.response import stationary_covariance, synchronous_response
+from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.waveform import Waveform, waveform_of
 from simulator.scenario import Event, Scenario, Sensors
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 from tests.diagnosis.sensors.test_sensor_checks import sources_along
 from tests.sure import sure
+from tests.windows import correlation, last_window
 
 RATE = 200.0
 
@@ -325,11 +330,10 @@ def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
     assert (found.speed_source, known.speed_source) == ("estimated", "phase reference")
     np.testing.assert_allclose(found.hop_speed_rad_s, known.hop_speed_rad_s, rtol=2e-3)
     assert found.synchronous is None
-    assert found.relative_synchronous is not None
-    assert known.hop_synchronous is not None
-    zero = np.abs(found.relative_synchronous.imag).max(axis=0).argmin()
-    turned = known.hop_synchronous * np.exp(-1j * np.angle(known.hop_synchronous[:, [zero]]))
-    error = np.abs(found.relative_synchronous - turned) / np.abs(turned).mean(axis=0)
+    relative, absolute = sure(found.relative_synchronous), sure(known.hop_synchronous)
+    zero = np.abs(relative.imag).max(axis=0).argmin()
+    turned = absolute * np.exp(-1j * np.angle(absolute[:, [zero]]))
+    error = np.abs(relative - turned) / np.abs(turned).mean(axis=0)
     assert np.median(error) < 0.05
 
 
@@ -374,3 +378,39 @@ def test_spectra_are_interpolated_across_lines_and_not_from_adjacent_ones() -> N
     assert np.abs(loud.spectrum_without_lines).max() <= np.abs(window.spectrum).max()
     everywhere = replace(window, lines=(ExcludedLine(20.0, 1000.0),))
     np.testing.assert_array_equal(everywhere.spectrum_without_lines, window.spectrum)
+
+
+SEED = 7_700_004
+
+
+@pytest.mark.slow
+def test_correlation_functions_and_synchronous_vectors_agree_with_theory() -> None:
+    """Twelve independent windows: every correlation at every lag within 5.5 standard errors of their mean.
+
+    Each of 8064 correlated comparisons, t-distributed with 11 degrees of freedom, exceeds 5.5 twice in ten thousand
+    runs, so a handful may: 0.1 % of them.
+    """
+    machine = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 30.0})})
+    condition = draw_condition(Draw(machine, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), 0)
+    quiet = condition.sensors.model_copy(update={"noise_relative": 0.0})
+    runs = [condition.model_copy(update={"sensors": quiet, "seed": SEED + number}) for number in range(12)]
+    streams = (blocks(run, machine, block_s=1.0) for run in runs)
+    windows = [last_window(plan_for(machine), (block for block, _ in stream)) for stream in streams]
+    speed = next(event.speed_rpm for event in condition.events if event.speed_rpm is not None) * 2 * np.pi / 60
+    A, B = expanded_A(machine.rotor, speed, condition.sources), expanded_B(condition.sources)
+    R0 = stationary_covariance(A, B)
+    index = [STATE_INDEX[name] for name in windows[0].states]
+    theory = np.stack([correlation(A, R0, lag)[np.ix_(index, index)] for lag in windows[0].lags_s])
+    estimates = np.stack([window.correlation for window in windows])
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(12)
+    deviation = np.abs(estimates.mean(axis=0) - theory) / error
+    assert np.mean(deviation > 5.5) < 1e-3
+    scale = np.sqrt(np.diagonal(R0)[index])
+    assert np.all(error / np.outer(scale, scale) < 0.05)  # or agreement would mean little
+    q1, q2 = synchronous_response(machine.rotor, speed)
+    expected = (q1 - 1j * q2)[index]
+    found = np.stack([window.synchronous for window in windows if window.synchronous is not None])
+    off = np.sqrt(np.var(found, axis=0, ddof=1) / 12)
+    assert np.all(np.abs(found.mean(axis=0) - expected) < 5 * off)
+    assert np.all(off < 0.05 * np.abs(expected))
+    assert windows[0].speed_rad_s == pytest.approx(speed, rel=1e-6)
