@@ -1,6 +1,5 @@
-"""Channels that lack numbers in a file are reported as missing, and the others imported and evaluated."""
+"""Channels that lack numbers in a file are reported as missing, and the others imported."""
 
-import json
 import re
 from datetime import UTC, datetime
 from functools import partial
@@ -12,17 +11,12 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from models.commissioning.commissioned import install
 from models.errors import MachineFileError
-from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
-from rotorwatch.records.health import Report
 from service.interchange.exporting import export
 from service.interchange.importing import summary_lines
-from service.recordings.replay.offline import OfflineReplay
-from service.recordings.replay.source import RecordingSource
 from tests.interchange.material import (
     CHANNELS,
     PULSES,
@@ -39,77 +33,49 @@ from tests.interchange.material import (
     table,
     with_cell,
 )
-from tests.service.rig.live import LAB, scenario_blocks
 
-KIT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 10.0, "max_span_s": 20.0})})
 MISSING = '[time]\nnot_finite = "missing"'
+MAPPING = TEXT.replace("[time]", MISSING)
 
 
-def blocks_of(recording: Path, described: MachineFile) -> list[SampleBlock]:
-    messages = read_recording(recording, keys={described.keys.stream})
+def blocks_of(recording: Path) -> list[SampleBlock]:
+    messages = read_recording(recording, keys={machine().keys.stream})
     return [decode_block(one.payload, one.attachment, one.encoding) for one in messages]
 
 
-def samples_of(recording: Path, described: MachineFile) -> FloatArray:
-    return np.concatenate([block.samples for block in blocks_of(recording, described)]).astype(np.float64)
+def samples_of(recording: Path) -> FloatArray:
+    return np.concatenate([block.samples for block in blocks_of(recording)]).astype(np.float64)
 
 
-def reports_of(recording: Path) -> list[Report]:
-    lines: list[str] = []
-    source = RecordingSource([recording])
-    assert OfflineReplay(source, source.machine(), install(KIT, None), lines.append).run().refused_blocks == {}
-    messages = [json.loads(line) for line in lines]
-    return [Report.model_validate(one["message"]) for one in messages if one["topic"] == KIT.keys.report]
-
-
-def test_a_temporarily_dead_probe_is_reported_and_the_others_are_evaluated(tmp_path: Path) -> None:
-    samples = np.concatenate([block.samples for block in scenario_blocks(40.0)]).astype(np.float64)
-    time_ns = 1_769_860_800 * 10**9 + np.arange(len(samples)) * 500_000
-    columns = {channel.name: samples[:, number] for number, channel in enumerate(KIT.sensors)}
-    mapping = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\nnot_finite = "missing"\n[channels]\n'
-    mapping += "".join(f'{one.name} = {{ column = "{one.name}", unit = "{one.unit}" }}\n' for one in KIT.sensors)
-    told, reports = "", list[list[Report]]()
-    for dead in (False, True):
-        lost = dead & (time_ns >= time_ns[22_000]) & (time_ns < time_ns[30_050])
-        content = pa.table({"t": time_ns, **columns, "z1": pa.array(columns["z1"], mask=lost)})
-        pa.parquet.write_table(content, tmp_path / "run.parquet")
-        done, recording = imported(tmp_path, tmp_path / "run.parquet", mapping, KIT)
-        assert (done.read.gaps, done.written.samples) == ([], len(samples))
-        told, reports = "\n".join(summary_lines(done)), [*reports, reports_of(recording)]
-    assert "missing, in whole blocks: z1, 4.1 s from 2026-01-31T12:00:11.000000Z to 2026-01-31T12:00:15.100000Z" in told
-    usual, lacking = reports
-    assert [one.end_ns for one in lacking] == [one.end_ns for one in usual]
-    found = [one for one in lacking if one.sensors]
-    assert {(fault.states, fault.kind) for one in found for fault in one.sensors} == {(("z1",), "missing")}
-    touched = [one.end_ns for one in usual if one.start_ns < time_ns[30_200] and one.end_ns > time_ns[22_000]]
-    assert [one.end_ns for one in found][: len(touched)] == touched
-    assert len(found) <= len(touched) + 1 < len(usual) - 2  # filters look a little further back
-    assert sum(len(one.levels) for one in found) > 0
-    for one, other in zip(lacking, usual, strict=True):
-        if one in found:
-            assert [level for level in one.levels if level.channel != "z1"] == [
-                level.model_copy(update={"s_max": None}) if level.channel == "y1" else level  # which needs both
-                for level in other.levels
-                if level.channel != "z1"
-            ]
-            assert {level.overall for level in one.levels if level.channel == "z1"} <= {None}
+def test_a_temporarily_dead_probe_is_missing_in_whole_blocks(tmp_path: Path) -> None:
+    """The tests of a monitor's missing channels show what becomes of it."""
+    time, x, v, a = signals(40_000)
+    lost = (time >= 11.0) & (time < 15.025)
+    pa.parquet.write_table(pa.table({"t": time, "x": pa.array(x, mask=lost), "v": v, "a": a}), tmp_path / "run.parquet")
+    done, recording = imported(tmp_path, tmp_path / "run.parquet", MAPPING)
+    assert (done.read.gaps, done.written.samples) == ([], 40_000)
+    told = "missing, in whole blocks: y1, 4.1 s from 2026-01-31T12:00:11.000000Z to 2026-01-31T12:00:15.100000Z"
+    assert told in "\n".join(summary_lines(done))
+    expected = np.column_stack([x, v, a])
+    expected[22_000:30_200, 0] = np.nan
+    np.testing.assert_array_equal(samples_of(recording), expected)
 
 
 @pytest.mark.parametrize("cell", ["", "NaN", "inf"])
 def test_an_empty_cell_takes_its_channel_out_of_one_block(tmp_path: Path, cell: str) -> None:
     source = table(tmp_path / "run.csv", with_cell(cell))
-    done, recording = imported(tmp_path, source, TEXT.replace("[time]", MISSING))
+    done, recording = imported(tmp_path, source, MAPPING)
     assert (done.read.left_out, done.read.gaps, done.written.samples) == (0, [], 1000)
     expected = np.column_stack(signals(1000)[1:])
     expected[600:800, 1] = np.nan
-    np.testing.assert_array_equal(samples_of(recording, machine()), expected)
+    np.testing.assert_array_equal(samples_of(recording), expected)
     # An export of the recording imports identically.
     export(selected(recording), "stream", "csv", tmp_path / "again.csv")
-    again = TEXT.replace("[time]", MISSING).replace(f'start = "{START}"', 'unit = "ns"\nstart = "unix"')
+    again = MAPPING.replace(f'start = "{START}"', 'unit = "ns"\nstart = "unix"')
     for name, column in {"t": "time_ns", "x": "y1 [um]", "v": "y1_dot [mm/s]", "a": "theta [rad]"}.items():
         again = again.replace(f'column = "{name}"', f'column = "{column}"')
     _, recording = imported(tmp_path, tmp_path / "again.csv", again)
-    np.testing.assert_array_equal(samples_of(recording, machine()), expected)
+    np.testing.assert_array_equal(samples_of(recording), expected)
 
 
 def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
@@ -118,15 +84,15 @@ def test_where_every_channel_is_missing_there_is_a_gap(tmp_path: Path) -> None:
         rows[row] = rows[row].split(",")[0] + ",,,"
     for row, lacking in {700: "{t},,{v},{a}", 701: "{t},{x},,{a}", 702: "{t},{x},{v},"}.items():
         rows[row] = lacking.format(**dict(zip("txva", rows[row].split(","), strict=True)))
-    done, recording = imported(tmp_path, table(tmp_path / "run.csv", rows), TEXT.replace("[time]", MISSING))
+    done, recording = imported(tmp_path, table(tmp_path / "run.csv", rows), MAPPING)
     told = "\n".join(summary_lines(done))
     assert "gaps: 1, 0.005 s in all" in told
     assert "beyond the dtype in every channel: 10" in told
     assert "samples left out in blocks in which every channel lacks numbers: 200" in told
     assert "shaft angle: 1320 rpm on average" in told
     assert done.written.lengths == [250, 400, 140]
-    assert np.diff([block.sequence for block in blocks_of(recording, machine())]).tolist() == [1, 2, 1, 2]
-    assert np.isfinite(samples_of(recording, machine())).all()
+    assert np.diff([block.sequence for block in blocks_of(recording)]).tolist() == [1, 2, 1, 2]
+    assert np.isfinite(samples_of(recording)).all()
 
 
 @pytest.mark.parametrize("handling", ["missing", "gap"])
@@ -140,7 +106,7 @@ def test_a_file_with_numbers_missing_in_every_channel_of_every_block_is_refused(
     rows = [row.split(",") for row in good_rows()]
     for number, row in enumerate(rows):
         row[1 + number % 3] = ""
-    told = fault(tmp_path, [",".join(row) for row in rows], TEXT.replace("[time]", MISSING))
+    told = fault(tmp_path, [",".join(row) for row in rows], MAPPING)
     assert "1000 rows, 1000 samples in blocks in which every channel lacks numbers, 0 gaps: no stretch" in told
 
 
@@ -150,7 +116,7 @@ def test_a_column_of_a_lower_rate_is_told_not_to_be_usable(tmp_path: Path) -> No
     dead = [",".join([t, x, "" if number < 700 else v, a]) for number, (t, x, v, a) in enumerate(rows)]
     told = []
     for one in (slow, dead):
-        done, _ = imported(tmp_path, table(tmp_path / "run.csv", one), TEXT.replace("[time]", MISSING))
+        done, _ = imported(tmp_path, table(tmp_path / "run.csv", one), MAPPING)
         told.append("note: no block without missing numbers: y1_dot;" in "\n".join(summary_lines(done)))
     assert told == [True, False]
 
@@ -162,9 +128,9 @@ def test_a_channel_with_no_data_in_the_file_is_missing_throughout(tmp_path: Path
     if kind == "parquet":  # in which such a column has no type
         content, source = pa.csv.read_csv(source), tmp_path / "run.parquet"
         pa.parquet.write_table(content, source)
-    done, recording = imported(tmp_path, source, TEXT.replace("[time]", MISSING))
+    done, recording = imported(tmp_path, source, MAPPING)
     assert "missing, in whole blocks: y1_dot, 0.5 s from" in "\n".join(summary_lines(done))
-    assert np.isnan(samples_of(recording, machine())).all(axis=0).tolist() == [False, True, False]
+    assert np.isnan(samples_of(recording)).all(axis=0).tolist() == [False, True, False]
 
 
 def test_missing_keyphasor_pulses_make_only_the_angle_missing(tmp_path: Path) -> None:
@@ -175,7 +141,7 @@ def test_missing_keyphasor_pulses_make_only_the_angle_missing(tmp_path: Path) ->
     done, recording = imported(tmp_path, archive(tmp_path, x=x, v=v, k=pulse), mapping)
     assert done.read.gaps == []
     assert f"rows without it because the shaft angle is not known: {done.angle.unknown}" in summary_lines(done)
-    samples = samples_of(recording, machine())
+    samples = samples_of(recording)
     assert samples.shape == (8000, 3)
     np.testing.assert_array_equal(samples[:, :2], np.column_stack([x, v]))
     lost = np.isnan(samples[:, 2])
@@ -197,13 +163,13 @@ def test_only_what_filters_derive_from_missing_numbers_is_missing(tmp_path: Path
     ).replace("[time]", MISSING)
     gravity = 40e-6 * omega**2 * np.cos(omega * time)
     _, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
-    whole = samples_of(recording, machine())
+    whole = samples_of(recording)
     dead = slice(int(50 * rate_hz), int(51 * rate_hz))  # seen by two of the filter's windows at the higher rate
     gravity[dead], x[dead.start + 7] = np.nan, np.nan
     gravity[: int(rate_hz)] = np.nan
     done, recording = imported(tmp_path, archive(tmp_path, x=x, a=a, g=gravity), mapping)
     assert re.search("missing, in whole blocks: y1_dot, .* s in 2 stretches from", "\n".join(summary_lines(done)))
-    samples = samples_of(recording, machine())
+    samples = samples_of(recording)
     lost = np.isnan(samples)
     assert lost.any(axis=0).tolist() == [True, True, False]
     assert lost[:, 0].sum() <= 2 * 200
@@ -229,6 +195,6 @@ def test_samples_that_an_mf4_file_marks_as_invalid_are_missing(tmp_path: Path) -
     with pytest.raises(MachineFileError, match="row 1001, column x: found nan, expected a finite number"):
         imported(tmp_path, path, CHANNELS, described)
     _, recording = imported(tmp_path, path, f"{MISSING}\n{CHANNELS}", described)
-    found = samples_of(recording, described)
+    found = samples_of(recording)
     np.testing.assert_array_equal(found[:, 0], np.where(invalid, np.nan, columns[0]))
     np.testing.assert_array_equal(found[:, 1:], np.column_stack(columns[1:]))
