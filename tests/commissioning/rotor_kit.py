@@ -104,12 +104,14 @@ def blind(machine: MachineFile, times: float = 1.0) -> MachineFile:
     return machine.model_copy(update={"sensors": sensors, "rotor": rotor, "operation": LAB.operation})
 
 
-def humming(stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 60e-6) -> list[SampleBlock]:
-    """The blocks with the floor shaken by another machine: the disc moves by 60 µm."""
+def humming(
+    stream_: Sequence[SampleBlock], line_hz: float, bearing_m: float = 60e-6, disc_m: float = 60e-6
+) -> list[SampleBlock]:
+    """The blocks with the floor shaken by another machine."""
     samples = samples_of(stream_)
     turned = 2 * np.pi * line_hz * np.arange(len(samples)) / LAB.rate_hz
     for column, channel in enumerate(LAB.sensors[:8]):
-        moved_m = bearing_m if channel.location == "bearing" else 60e-6
+        moved_m = bearing_m if channel.location == "bearing" else disc_m
         hum = 2 * np.pi * line_hz * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
         samples[:, column] += moved_m * hum / channel.to_si
     return with_samples(stream_, samples)

@@ -110,17 +110,11 @@ def test_without_motion_sensors_only_levels_are_commissioned(known: MachineFile)
 def test_a_wrong_heavy_spot_angle_in_the_file_is_refused_with_the_measured_one() -> None:
     operation = LAB.operation.model_copy(update={"unbalance_phase_rad": 1.5})
     elsewhere_now = LAB.model_copy(update={"operation": operation})
-    report = commissioned(elsewhere_now, healthy(LAB, 75.0, 4_910_011)).report
+    file, seen = with_sensors(elsewhere_now, stream(70.0, 41), lambda sensor: sensor.name in {"y1", "z1", "theta"})
+    report = commissioned(file, recording(file, seen)).report
     assert report.verdict == "refused"
     assert "is 0° from the phase reference, whereas the file has it at 86°" in report.summary
     assert "unbalance_phase_rad = " in report.summary
-
-
-def test_an_unbalance_far_below_the_recorded_one_in_the_file_is_refused() -> None:
-    rotor = LAB.rotor.model_copy(update={"e_m": LAB.rotor.e_m / 40})
-    report = commissioned(LAB.model_copy(update={"rotor": rotor}), healthy(LAB, 75.0, 4_910_012)).report
-    assert report.verdict == "refused"
-    assert "unbalance (eccentricity) differs between the healthy data and the parameters in the" in report.summary
 
 
 def test_samples_in_a_wrong_unit_are_doubted_and_a_huge_unbalance_later_may_be_a_lost_part() -> None:
@@ -164,7 +158,8 @@ def test_a_heavy_rotor_with_sensors_in_the_vertical_alone_is_identified() -> Non
     rotor = sure(PARTIAL.rotor)
     heavier = {name: 16 * getattr(rotor, name) for name in ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2")}
     heavier["shaft_diameter_m"] = 2 * sure(rotor.shaft_diameter_m)
-    heavy = PARTIAL.model_copy(update={"rotor": rotor.model_copy(update=heavier)})
+    shorter = PARTIAL.window.model_copy(update={"segment_s": 2.0})  # of which a spectrum takes less time
+    heavy = PARTIAL.model_copy(update={"rotor": rotor.model_copy(update=heavier), "window": shorter})
     file, vertical = with_sensors(heavy, stream(70.0, 41), lambda sensor: sensor.direction != "y")
     made = commissioned(file, recording(file, vertical))
     assert made.report.verdict == "limited"  # by its length alone
@@ -324,10 +319,10 @@ def test_a_healthy_misfit_that_varies_with_excitation_is_tolerated_later() -> No
 @pytest.mark.parametrize("level", ["partial", pytest.param("full", marks=pytest.mark.long)])
 def test_a_misfit_of_the_healthy_machine_is_no_misfit_of_a_later_window(level: str) -> None:
     made, machine = sure(made_at(level).commissioned), MACHINES[level]
-    assert made.misfit is not None
+    misfit = sure(made.misfit)
     assert "misfit" not in json.loads(made.model_copy(update={"misfit": None}).model_dump_json())
-    assert made.misfit.error == pytest.approx((60 / 35 / 2) ** 0.5, rel=0.05)  # of 70 s
-    assert abs(made.misfit.mean) < 5 * made.misfit.error
+    assert misfit.error == pytest.approx((60 / 35 / 2) ** 0.5, rel=0.05)  # of 70 s
+    assert abs(misfit.mean) < 5 * misfit.error
     (window,) = windows_of(healthy(machine, 66.0, 43))
 
     def judged(known: HealthyMisfit | None) -> Diagnosis:
@@ -335,10 +330,10 @@ def test_a_misfit_of_the_healthy_machine_is_no_misfit_of_a_later_window(level: s
         return evaluator_for(installed).evaluate(window).deciding
 
     raw = judged(None)
-    assert raw.goodness is not None
-    scores = {one.tried: one.z for one in raw.goodness.alternatives}
-    assert len(scores) == len(raw.goodness.alternatives)
-    exact = HealthyMisfit(mean=0.0, scores=scores, error=0.0, excess=raw.goodness.excess_z, excess_error=0.0)
+    goodness = sure(raw.goodness)
+    scores = {one.tried: one.z for one in goodness.alternatives}
+    assert len(scores) == len(goodness.alternatives)
+    exact = HealthyMisfit(mean=0.0, scores=scores, error=0.0, excess=goodness.excess_z, excess_error=0.0)
     assert (judged(exact).misfit_z or 0.0) < sure(raw.misfit_z)
     shifted = exact.model_copy(update={"scores": scores | {"mass of the disc": scores["mass of the disc"] - 12.0}})
     assert (judged(shifted).misfit_z or 0.0) > 10.0
@@ -349,18 +344,17 @@ def test_a_misfit_of_the_healthy_machine_is_no_misfit_of_a_later_window(level: s
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["partial", "none", pytest.param("full", marks=pytest.mark.long)])
 def test_a_commissioned_bundle_round_trips_through_its_file(level: str, tmp_path: Path) -> None:
-    made, machine = made_at(level), MACHINES[level]
-    assert made.commissioned is not None
-    assert made.report.level == level
-    (tmp_path / FILE).write_text(made.commissioned.model_dump_json(indent=1))
+    made, machine = sure(made_at(level).commissioned), MACHINES[level]
+    assert made_at(level).report.level == level
+    (tmp_path / FILE).write_text(made.model_dump_json(indent=1))
     again = load_commissioned(tmp_path, machine)
-    assert again == made.commissioned
-    assert again.identity == made.commissioned.identity
+    assert again == made
+    assert again.identity == made.identity
     installed = install(machine, tmp_path)
     assert installed.identity == again.identity
     assert (installed.known is None) == (level == "none")
     (window,) = windows_of(healthy(machine, 66.0, 43))
-    for fresh, restored in zip(made.commissioned.baselines, again.baselines, strict=True):
+    for fresh, restored in zip(made.baselines, again.baselines, strict=True):
         first, second = (BaselineDiagnostician(one.baseline).diagnose(window) for one in (fresh, restored))
         assert first.parameters == second.parameters
 
