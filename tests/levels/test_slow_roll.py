@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.window.moments import plan_for
 from models.diagnosis.window.sliding import SlidingWindow
@@ -93,25 +92,12 @@ def with_run_out(samples: FloatArray) -> FloatArray:
     return seen
 
 
-def test_the_unbalance_is_read_without_the_run_out() -> None:
-    machine, samples = simulated()
-
-    def unbalance(of: Machine, seen: FloatArray) -> float:
-        (found,) = [one for one in LikelihoodFit(of).diagnose(statistics(of, seen)).parameters if one.name == "e"]
-        return sure(found.relative_change)
-
-    true = unbalance(machine, samples)
-    assert abs(unbalance(machine, with_run_out(samples)) - true) > 0.01
-    assert unbalance(with_slow_roll(machine), with_run_out(samples)) == pytest.approx(true, abs=1e-3)
-
-
 def test_sensors_are_judged_without_run_out_compensation() -> None:
     machine, samples = simulated()
     compensated, measured = (statistics(one, with_run_out(samples)) for one in (with_slow_roll(machine), machine))
-    assert measured.synchronous is not None
-    assert abs(sure(compensated.synchronous)[0] - measured.synchronous[0]) == pytest.approx(8e-6)
+    assert abs(sure(compensated.synchronous)[0] - sure(measured.synchronous)[0]) == pytest.approx(8e-6)
     assert np.array_equal(compensated.spectrum, measured.spectrum)
-    assert np.array_equal(sure(compensated.as_mounted.synchronous), measured.synchronous)
+    assert np.array_equal(sure(compensated.as_mounted.synchronous), sure(measured.synchronous))
     assert sensor_findings(compensated, None, machine.sensors) == sensor_findings(measured, None, machine.sensors)
 
 
@@ -132,7 +118,6 @@ def test_a_slow_roll_vector_does_not_change_the_stream() -> None:
     machine, _ = simulated()
     compensated = with_slow_roll(machine)
     assert compensated.descriptor == machine.descriptor
-    assert compensated.descriptor.schema_hash == machine.descriptor.schema_hash
     assert load_machine("lab").model_dump() == load_machine_file("lab").model_dump()
     assert "slow_roll" not in machine.model_dump_json()
     assert Machine.model_validate(compensated.model_dump()) == compensated
