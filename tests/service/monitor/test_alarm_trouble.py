@@ -464,8 +464,8 @@ def test_gaps_and_silences_have_the_time_without_data_as_evidence() -> None:
     assert named((lost, again, gap)) == [("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP)]
     end_ns = block(0).end_ns
     for event, until_ns in ((lost, end_ns + 5 * S), (gap, block(21).start_ns)):
-        assert event.alarm.evidence is not None
-        assert (event.alarm.evidence.start_ns, event.alarm.evidence.end_ns) == (end_ns, until_ns)
+        evidence = sure(event.alarm.evidence)
+        assert (evidence.start_ns, evidence.end_ns) == (end_ns, until_ns)
     monitor = MachineMonitor(install(machine(), None))
     monitor.step(block(0))
     (lost,) = monitor.passed(START_NS + 20 * S)

@@ -18,7 +18,7 @@ from models.levels.settings import LevelSettings
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
-from models.signals.channels import Quantity, Sensor
+from models.signals.channels import Sensor
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
@@ -29,6 +29,7 @@ from tests.commissioning.rotor_kit import (
     NOTHING,
     commissioned,
     factored,
+    humming,
     mounted,
     no_velocity,
     recording,
@@ -62,6 +63,12 @@ def full(windows: Sequence[Report]) -> list[Report]:
     return [window for window in windows if window.filled == 1.0]
 
 
+def watched(seen: Sequence[SampleBlock]) -> tuple[list[Report], set[str]]:
+    """Reports on full windows, and the alarms apart from levels."""
+    windows, events = feed(MachineMonitor(installed()), seen)
+    return full(windows), {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
+
+
 def test_the_healthy_machine_stays_healthy() -> None:
     windows, events = feed(MachineMonitor(installed()), stream(85.0, SEED + 1))
     assert len(full(windows)) >= 5
@@ -79,11 +86,10 @@ def test_the_healthy_machine_stays_healthy() -> None:
     [("c_bz", -0.4), *(pytest.param(*one, marks=pytest.mark.long) for one in (("k_by", -0.2), ("e", 0.5)))],
 )
 def test_a_change_is_named_alone(name: str, change: float) -> None:
-    blocks = stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
-    windows, events = feed(MachineMonitor(installed()), blocks)
-    verdict = sure(full(windows)[-1].verdict)
+    windows, alarms = watched(stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change)))
+    verdict = sure(windows[-1].verdict)
     assert [finding.name for finding in verdict.changed] == [name]
-    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {name}
+    assert alarms == {name}
     (reading,) = (one for one in verdict.current if one.name == name)
     low, high = sure(reading.interval_95)
     assert low - 0.05 < change < high + 0.05
@@ -97,9 +103,9 @@ def test_exchanged_sensors_of_a_place_raise_a_data_alarm_and_no_parameter() -> N
     for rate in ("", "_dot"):
         own, other = names.index(f"y1{rate}"), names.index(f"z1{rate}")
         wired[:, [own, other]] = samples[:, [other, own]]
-    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, wired))
-    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-swapped"}
-    assert not any(window.parameters for window in full(windows))
+    windows, alarms = watched(with_samples(healthy, wired))
+    assert alarms == {"data-swapped"}
+    assert not any(window.parameters for window in windows)
 
 
 @pytest.mark.parametrize("change", [0.0, -0.35])
@@ -107,15 +113,11 @@ def test_a_gain_that_has_drifted_a_little_widens_the_readings_of_its_plane(chang
     """Which of the two sensors has drifted is not known: the reading of k_by is wrong by all of it or hardly at all."""
     event = Event(at_s=0.0, parameter="k_by", relative_change=change)
     ran = stream(65.0, SEED + 2, *([event] if change else []))
-    plain, drifted = (feed(MachineMonitor(installed()), seen) for seen in (ran, factored(MACHINE, ran, y2_dot=1.03)))
-    raised = {event.alarm.name for event in drifted[1] if not event.alarm.name.startswith(LEVEL)}
-    assert raised == {"data-gain"} | ({"k_by"} if change else set())
-    last = full(drifted[0])[-1]
+    (*_, plain), _ = watched(ran)
+    (*_, last), alarms = watched(factored(MACHINE, ran, y2_dot=1.03))
+    assert alarms == {"data-gain"} | ({"k_by"} if change else set())
     assert last.state is (HealthState.DANGER if change else HealthState.DATA_HEALTH)
-    assert "diagnosed with larger errors" in last.sensors[0].text
-    before, now = (
-        {one.name: sure(one.standard_error) for one in full(fed[0])[-1].parameters[:5]} for fed in (plain, drifted)
-    )
+    before, now = ({one.name: sure(one.standard_error) for one in of.parameters[:5]} for of in (plain, last))
     for name in ("k_by", "c_by", "e"):
         assert now[name] > 0.9 * np.hypot(before[name], 0.02 * (1 + change * (name == "k_by")))
     assert now["k_bz"] < 1.1 * before["k_bz"]
@@ -125,8 +127,7 @@ def test_a_drifted_gain_widens_a_reading_by_what_it_changes_there() -> None:
     """The relation was learned on so little data that a gain of y1 changes k_by by more than twice as much."""
     ran = stream(65.0, SEED + 2)
     plain, drifted = (
-        {one.name: one for one in full(feed(MachineMonitor(installed()), seen)[0])[-1].parameters}
-        for seen in (ran, factored(MACHINE, ran, y1=0.95))
+        {one.name: one for one in watched(seen)[0][-1].parameters} for seen in (ran, factored(MACHINE, ran, y1=0.95))
     )
     wrong = sure(drifted["k_by"].relative_change) - sure(plain["k_by"].relative_change)
     assert 0.08 < wrong < 1.5 * sure(drifted["k_by"].standard_error)
@@ -159,27 +160,24 @@ def test_a_drifted_gain_of_a_sensor_at_45_degrees_widens_both_planes() -> None:
 
 
 def test_what_becomes_of_the_diagnosis_is_said_of_each_faulty_sensor() -> None:
-    windows, _ = feed(MachineMonitor(installed()), factored(MACHINE, stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
-    dead, drifted = full(windows)[-1].sensors
+    windows, _ = watched(factored(MACHINE, stream(65.0, SEED + 2), y1=np.nan, z2=1.04))
+    dead, drifted = windows[-1].sensors
     assert dead.text.endswith("the machine is diagnosed without it")
     assert drifted.text.endswith("the machine is diagnosed with larger errors")
 
 
 def test_a_gain_that_has_drifted_far_stops_the_diagnosis() -> None:
-    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, stream(65.0, SEED + 1), y2_dot=1.08))
-    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-gain"}
-    assert not any(window.parameters for window in full(windows))
+    windows, alarms = watched(factored(MACHINE, stream(65.0, SEED + 1), y2_dot=1.08))
+    assert alarms == {"data-gain"}
+    assert not any(window.parameters for window in windows)
 
 
 def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
     """The relation that was learned with the dead sensor is not read; the other still holds."""
     ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
-    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, ran, y1=np.nan))
-    raised = {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)}
-    assert raised == {"data-missing", "k_bz"}
-    last = full(windows)[-1]
+    (*_, last), alarms = watched(factored(MACHINE, ran, y1=np.nan))
+    assert alarms == {"data-missing", "k_bz"}
     assert last.state is HealthState.ALERT
-    assert last.sensors[0].text.endswith("the machine is diagnosed without it")
     readings = {one.name: one for one in last.parameters}
     assert readings["k_by"].relative_change is None
     assert "y1" in readings["k_by"].reason
@@ -190,9 +188,9 @@ def test_a_change_of_the_other_plane_is_named_without_a_dead_sensor() -> None:
 def test_a_plane_is_diagnosed_without_any_sensor_of_the_other() -> None:
     ran = stream(65.0, SEED + 2, Event(at_s=0.0, parameter="k_bz", relative_change=-0.35))
     dead = dict.fromkeys(("y1", "y2", "y1_dot", "y2_dot"), np.nan)
-    windows, events = feed(MachineMonitor(installed()), factored(MACHINE, ran, **dead))
-    assert {event.alarm.name for event in events if not event.alarm.name.startswith(LEVEL)} == {"data-missing", "k_bz"}
-    read = {one.name for one in full(windows)[-1].parameters if one.relative_change is not None}
+    windows, alarms = watched(factored(MACHINE, ran, **dead))
+    assert alarms == {"data-missing", "k_bz"}
+    read = {one.name for one in windows[-1].parameters if one.relative_change is not None}
     assert read == {"k_bz", "c_bz", "e"}
 
 
@@ -288,15 +286,7 @@ def test_a_wrong_gain_at_a_place_is_suspected_and_no_parameter_named() -> None:
     ],
 )
 def test_a_line_that_the_healthy_machine_lacked_is_suspected(hz: float, told: tuple[str, ...]) -> None:
-    healthy = stream(63.0, SEED + 9)
-    samples = samples_of(healthy)
-    turned = 2 * np.pi * hz * np.arange(len(samples)) / LAB.rate_hz
-    for column, one in enumerate(LAB.sensors):
-        if one.quantity is Quantity.DISPLACEMENT:
-            samples[:, column] += 2e-5 / one.to_si * np.sin(turned)
-        elif one.quantity is Quantity.VELOCITY:
-            samples[:, column] += 2e-5 / one.to_si * 2 * np.pi * hz * np.cos(turned)
-    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    windows, events = feed(MachineMonitor(installed()), humming(stream(63.0, SEED + 9), hz, 20e-6, 20e-6))
     raised = {event.alarm.name: event.alarm for event in events}
     assert all(part in raised[MODEL].note for part in told), raised[MODEL].note
     assert all(window.suspect for window in full(windows))

@@ -165,11 +165,9 @@ def test_first_windows_are_kept_unless_sensors_or_their_settings_change(changes:
 def test_commissioned_levels_are_the_reference_and_the_state_is_unchanged(tmp_path: Path) -> None:
     found = healthy_from_blocks("healthy.mcap", FAN, blocks(6, 150))
     made = commissioned(FAN, found)
-    assert made.commissioned is not None, made.report.summary
     assert made.report.verdict == "limited"
-    (tmp_path / FILE).write_text(made.commissioned.model_dump_json())
-    installed: Installed = install(FAN, tmp_path)
-    monitor = MachineMonitor(installed)
+    (tmp_path / FILE).write_text(sure(made.commissioned).model_dump_json())
+    monitor = MachineMonitor(install(FAN, tmp_path))
     assert monitor.watching  # so no window is skipped when the computer cannot keep up
     _, events = run(monitor, blocks(7, 60))
     assert (monitor.health().state, monitor.health().reason, events) == (HealthState.UNCHANGED, "", [])
@@ -282,10 +280,9 @@ def test_a_watched_machine_states_the_detectable_level_growth() -> None:
     run(monitor, blocks(1, 70, first=60))
     now = latest(monitor)
     assert now.state == HealthState.WATCHING
-    assert now.level_growth is not None
-    assert now.level_growth.growth is not None
-    assert 0.5 < now.level_growth.growth < 0.9
-    _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
+    growth = sure(sure(now.level_growth).growth)
+    assert 0.5 < growth < 0.9
+    _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + growth)), first=200))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
     assert latest(monitor).level_growth is None  # the alert replaces it
     assert monitor.health().state is HealthState.ALERT

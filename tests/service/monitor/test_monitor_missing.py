@@ -149,9 +149,7 @@ def test_first_windows_with_a_lost_angle_are_not_a_reference(lost: float) -> Non
     first = LAB.levels.model_copy(update={"reference": "first windows", "reference_windows": 2})
     monitor = MachineMonitor(install(KIT.model_copy(update={"levels": first}), None))
     feed(monitor, without(THETA, 25.0, 26.0, lost, end_s=80.0))
-    reference = monitor._levels.reference
-    assert reference is not None
-    (state,) = reference.states
+    (state,) = sure(monitor._levels.reference).states
     assert state.windows == 2
     assert state.speed_rad_s == pytest.approx((LAB.operation.speed_rad_s,) * 2)
 
