@@ -11,7 +11,7 @@ from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, machine_of, sampled
 from benchmarks.finite_elements.observed import blocks as observed_blocks
 from benchmarks.finite_elements.scenes import SceneRange, SourceLayout, drawn_condition
-from benchmarks.studies.subjects.watched import commissioned as watched
+from benchmarks.studies.subjects.watched import commissioned as commissioned_blocks
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.levels.settings import LevelSettings
@@ -373,7 +373,7 @@ def test_where_no_equation_can_be_evaluated_a_natural_frequency_shows_a_softer_b
         drawn = drawn_condition(rotor, SourceLayout.INDEPENDENT, limits, changes, rng)
         return list(observed_blocks(sampled(rotor, drawn, duration_s, [SEED, number], probes), file.descriptor))
 
-    made = watched(file, *(recorded(number, 150.0) for number in range(3)))
+    made = commissioned_blocks(file, *(recorded(number, 150.0) for number in range(3)))
     assert isinstance(made, Installed)
     monitor = MachineMonitor(made)
     windows, events = feed(monitor, recorded(3, 90.0, k_by=-0.3))
