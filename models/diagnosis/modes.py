@@ -42,7 +42,7 @@ _MULTIPLES, _BESIDE = 6, 0.02  # multiples of running speed, and how near a pole
 _FULL_RANK = 1e-10  # least part of the largest direction that the smallest must have to be more than rounding
 # How close poles of one mode are: of different orders in one window, and of different windows.
 _BETWEEN_ORDERS, _BETWEEN_WINDOWS = (0.015, 0.9), (0.03, 0.85)
-_FEWEST_ORDERS = 5
+_FEWEST_ORDERS = 6  # of the eleven
 _ALIKE = 0.6  # least MAC of a mode before and after a change; a half is as near to an orthogonal one
 
 
@@ -53,6 +53,7 @@ class Mode:
     frequency_hz: float
     damping: float  # ratio
     shape: ComplexArray  # (n_states,), of length 1
+    orders: int = 1  # model orders at which it was found
 
 
 class HealthyMode(BaseModel, extra="forbid", frozen=True, strict=True):
@@ -138,7 +139,7 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
         return ""
 
     def _matched(self, found: Sequence[Mode]) -> dict[int, Mode]:
-        """The mode found for each healthy one: of the same shape, at the nearest frequency."""
+        """The mode found for each healthy one: of the same shape, at most orders and, of equals, nearest to it."""
         shapes = np.array([mode.vector for mode in self.modes])
         healthy_hz = np.array([mode.frequency_hz for mode in self.modes])
         claims = []
@@ -147,8 +148,8 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
             alike = np.where(apart < _REACH, _assurance(shapes, mode.shape[None, :])[:, 0], 0.0)
             best = int(np.argmax(alike))
             if alike[best] > _ALIKE:
-                claims.append((float(apart[best]), best, mode))
-        return {best: mode for _, best, mode in sorted(claims, key=itemgetter(0), reverse=True)}
+                claims.append(((mode.orders, -float(apart[best])), best, mode))
+        return {best: mode for _, best, mode in sorted(claims, key=itemgetter(0))}
 
 
 def _judged(
@@ -248,7 +249,7 @@ def modes_of(window: WindowStatistics, states: Sequence[str]) -> list[Mode]:
         if len(group) < _FEWEST_ORDERS:
             break
         frequency, damping = np.median([(poles[at].frequency_hz, poles[at].damping) for at in group], axis=0).tolist()
-        found.append(Mode(frequency, damping, poles[group[0]].shape))
+        found.append(Mode(frequency, damping, poles[group[0]].shape, len(group)))
     return sorted(found, key=lambda mode: mode.frequency_hz)
 
 
