@@ -30,6 +30,8 @@ from rotorwatch.records.windows import NaturalFrequency
 
 LEAST_CHANGE = 0.025
 """Least relative change that is reported: so far a frequency may move with the force, the load or the temperature."""
+_GROWTH = 0.025
+"""How far a frequency may move if all motions are e times as powerful as recorded: a bearing may stiffen with them."""
 CONFIRMED = -1
 _REACH = 0.15  # largest relative change for which the mode is looked for
 MOST_LIMIT = 0.1  # a mode whose limit is wider says nothing
@@ -87,6 +89,7 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
 
     states: tuple[str, ...] = Field(min_length=2)
     speed_rad_s: tuple[FiniteFloat, FiniteFloat] | None  # slowest and fastest window; None where a speed is not known
+    powers: tuple[tuple[FiniteFloat, FiniteFloat], ...]  # least and largest mean square of each state, SI
     modes: tuple[HealthyMode, ...] = Field(min_length=1)
 
     def limits(self, rate: float) -> list[tuple[HealthyMode, float]]:
@@ -100,7 +103,8 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
         """Compare the natural frequencies of a window with those of the healthy machine.
 
         A change is reported once two windows without common data show it, and none in between shows the healthy
-        frequency. Modes whose limit is too wide are left out.
+        frequency. Modes whose limit is too wide are left out. Limits are wider in a window that moves
+        more or less than the healthy ones.
 
         Parameters
         ----------
@@ -118,14 +122,19 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
             The same after this window.
         """
         why = self._not_comparable(window)
+        wider = 0.0 if why else self._by_growth(window)
         now = {} if why else self._matched(modes_of(window, self.states))
-        judged = []
+        found, beyond = [], []
         for number, (mode, since_ns) in enumerate(zip(self.modes, beyond_ns, strict=True)):
             limit = mode.limit(rate / len(self.modes))
+            if limit > MOST_LIMIT:
+                beyond.append(0)
+                continue
             hidden = why or ("" if number in now else "not found in this window: excited too little, or hidden")
-            judged.append(_judged(mode, limit, hidden or now[number], window, since_ns))
-        seen = tuple(one for one, _ in judged if one.limit <= MOST_LIMIT)
-        return seen, tuple(since_ns if one.limit <= MOST_LIMIT else 0 for one, since_ns in judged)
+            judged, since_ns_now = _judged(mode, limit + wider, hidden or now[number], window, since_ns)
+            found.append(judged)
+            beyond.append(since_ns_now)
+        return tuple(found), tuple(beyond)
 
     def _not_comparable(self, window: WindowStatistics) -> str:
         if missing := [state for state in self.states if state not in window.states]:
@@ -137,6 +146,12 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
             if not slowest * (1 - _SPEED_TOLERANCE) <= now <= fastest * (1 + _SPEED_TOLERANCE):
                 return f"speed {now * rpm:.0f} rpm, commissioned at {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
         return ""
+
+    def _by_growth(self, window: WindowStatistics) -> float:
+        """How far frequencies may have moved because motions are larger or smaller than recorded."""
+        least, largest = np.array(self.powers).T
+        now = np.maximum(_powers(window, self.states), np.finfo(float).tiny)
+        return _GROWTH * float(np.mean(np.maximum(np.maximum(np.log(now / largest), np.log(least / now)), 0.0)))
 
     def _matched(self, found: Sequence[Mode]) -> dict[int, Mode]:
         """The mode found for each healthy one: of the same shape, at most orders and, of equals, nearest to it."""
@@ -202,11 +217,20 @@ def learn_modes(windows: Sequence[WindowStatistics], states: tuple[str, ...]) ->
     if not modes:
         return None
     speeds = [window.speed_rad_s for window in windows]
+    powers = np.array([_powers(window, states) for window in windows])
     return HealthyModes(
         states=states,
+        powers=tuple(zip(powers.min(axis=0).tolist(), powers.max(axis=0).tolist(), strict=True)),
         speed_rad_s=(min(speeds), max(speeds)) if all(map(math.isfinite, speeds)) else None,
         modes=tuple(sorted(modes, key=lambda mode: mode.frequency_hz)),
     )
+
+
+def _powers(window: WindowStatistics, states: Sequence[str]) -> FloatArray:
+    """Mean square of each motion with its synchronous part, shape (n_states,)."""
+    columns = [window.states.index(state) for state in states]
+    found = window.correlation[0, columns, columns]
+    return found if window.synchronous is None else found + np.abs(window.synchronous[columns]) ** 2 / 2
 
 
 def modes_of(window: WindowStatistics, states: Sequence[str]) -> list[Mode]:

@@ -94,6 +94,20 @@ def test_a_mode_that_is_damped_much_is_not_watched() -> None:
     assert [mode for mode, _ in learned().limits(RATE)] == list(learned().modes[:2])
 
 
+def test_limits_are_wider_where_a_window_moves_more_or_less_than_recorded() -> None:
+    window, none = recorded(0, 4)[0], (0,) * len(learned().modes)
+
+    def limit(factor: float) -> float:
+        moved = replace(
+            window, correlation=window.correlation * factor**2, synchronous=sure(window.synchronous) * factor
+        )
+        return learned().judge(moved, none, RATE)[0][0].limit
+
+    assert limit(1.0) == pytest.approx(learned().limits(RATE)[0][1])
+    assert limit(30.0) - limit(10.0) == pytest.approx(0.05 * np.log(3))
+    assert limit(1 / 30.0) - limit(1 / 10.0) == pytest.approx(0.05 * np.log(3))
+
+
 def test_few_windows_have_wide_limits() -> None:
     few, many = (learned().modes[0].model_copy(update={"windows": count, "spread": 0.005}) for count in (4, 12))
     assert few.limit(RATE) > 3 * many.limit(RATE)
