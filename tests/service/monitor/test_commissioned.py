@@ -375,8 +375,15 @@ def test_where_no_equation_can_be_evaluated_a_natural_frequency_shows_a_softer_b
 
     made = commissioned_blocks(file, *(recorded(number, 150.0) for number in range(3)))
     assert isinstance(made, Installed)
-    monitor = MachineMonitor(made)
-    windows, events = feed(monitor, recorded(3, 90.0, k_by=-0.3))
+    softer, monitor, again = recorded(3, 90.0, k_by=-0.3), MachineMonitor(made), MachineMonitor(made)
+    windows, events = feed(monitor, softer[:90])
+    state = monitor.state(whole=True)
+    again.restore(state.state, [dict(state.new_parts)[name] for name in state.parts])
+    later, told = feed(monitor, softer[90:])
+    assert [one.natural_frequencies for one in feed(again, softer[90:])[0]] == [
+        one.natural_frequencies for one in later
+    ]
+    windows, events = [*windows, *later], [*events, *told]
     verdicts = [{one.verdict for one in window.natural_frequencies} for window in full(windows)]
     assert not any("changed" in found for found in verdicts[:5])  # these share data with the first window
     assert "changed" in verdicts[-1]
