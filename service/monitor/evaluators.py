@@ -77,7 +77,9 @@ class BaselineEvaluator(WindowEvaluator):
         self._naming = Naming(machine.sensors)
         self._diagnosed = states_of(machine) != ()
         self._lines = commissioned.lines != ()  # without any, relations were learned with all lines left in
-        self._shape, self._modes = commissioned.shape, commissioned.modes
+        self._modes = commissioned.modes
+        # Where a relation cannot be read in a window, its force is unlike the recorded ones: that changes shapes, too.
+        self._shape = None if commissioned.baselines and commissioned.modes else commissioned.shape
         self._beyond_ns = (0,) * (0 if self._modes is None else len(self._modes.modes))
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
