@@ -25,7 +25,7 @@ def overview(health: Health) -> Health:
     if verdict is not None:
         current = _named(verdict.current, names)
         verdict = verdict.model_copy(update={"current": current, "candidates": (), "alternatives": ()})
-    left_out = dict.fromkeys(("opinions", "equations", "sensors", "shapes"), ())
+    left_out = dict.fromkeys(("opinions", "equations", "sensors", "shapes", "natural_frequencies"), ())
     kept = {
         "verdict": verdict,
         "parameters": _named(report.parameters, names),

@@ -64,6 +64,7 @@ class MachineView extends MachineElement {
   /** Shapes of the channels, for machines whose equations cannot be evaluated, and natural frequencies that are watched. */
   #shapes() {
     const { shapes = [], natural_frequencies: frequencies = [] } = this.health?.report ?? {};
+    /** @param {string} text @param {{text: string}[]} found */
     const listed = (text, found) => found.length > 0 && html("div", {}, html("p", {}, text), html("ul", {}, ...found.map((one) => html("li", {}, one.text))));
     return html("div", {}, listed("Each channel compared with its own healthy shape; no part of the machine can be named:", shapes), listed("Natural frequencies, watched because a stiffness is read badly or not at all:", frequencies));
   }

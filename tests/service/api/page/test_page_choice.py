@@ -12,7 +12,7 @@ from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.levels import ChannelLevels, LevelLimits
-from rotorwatch.records.windows import Parameter
+from rotorwatch.records.windows import NaturalFrequency, Parameter
 from service.analysis.overview import nearness, overview
 from tests.service.api.page.browsing import run_deno
 from tests.sure import sure
@@ -117,8 +117,12 @@ def test_an_overview_keeps_only_what_alarms_are_about_or_what_is_nearest_to_its_
         assert parameters | {f"level:{one.channel}" for one in brief.levels} == expected - {"stream-lost"}
         assert {one.name for one in sure(brief.verdict).current} == parameters
         assert {one.name for one in brief.detectable} <= parameters
-    brief = sure(overview(Health.model_validate(example(Health))).report)
-    assert (brief.opinions, brief.equations, sure(brief.verdict).candidates) == ((), (), ())
+    shown = Health.model_validate(example(Health))
+    seen = sure(shown.report).model_copy(
+        update={"natural_frequencies": (NaturalFrequency.model_validate(example(NaturalFrequency)),)}
+    )
+    brief = sure(overview(shown.model_copy(update={"report": seen})).report)
+    assert (brief.opinions, brief.equations, brief.natural_frequencies, sure(brief.verdict).candidates) == ((),) * 4
 
 
 def test_the_page_and_the_service_agree_on_nearness_to_limits(found: list[Found]) -> None:
