@@ -102,7 +102,8 @@ class Evaluation:
     @property
     def unlike_healthy(self) -> str:
         """What differs from the healthy machine where no equation can be evaluated, or in natural frequencies."""
-        return "; ".join(filter(None, (self.deciding.suspect, *self._changed)))
+        suspect = self.deciding.suspect if self.shapes else ""  # of a reading, it is told by the alarm `model`
+        return "; ".join(filter(None, (suspect, *self._changed)))
 
     @property
     def _changed(self) -> list[str]:

@@ -14,13 +14,17 @@ from benchmarks.finite_elements.scenes import SceneRange, SourceLayout, drawn_co
 from benchmarks.studies.subjects.watched import commissioned as commissioned_blocks
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
+from models.diagnosis.readings import Diagnosis
 from models.levels.settings import LevelSettings
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.channels import Sensor
 from rotorwatch.records.alarms import Severity
+from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState, Report
+from rotorwatch.records.windows import NaturalFrequency
+from service.monitor.evaluation import Evaluation
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
 from simulator.stream import blocks
@@ -389,6 +393,15 @@ def test_where_no_equation_can_be_evaluated_a_natural_frequency_shows_a_softer_b
     assert "changed" in verdicts[-1]
     assert "natural frequency" in full(windows)[-1].reason
     assert "shape" in {event.alarm.name for event in events}
+
+
+def test_what_a_reading_makes_suspect_is_no_changed_natural_frequency() -> None:
+    frequency = NaturalFrequency.model_validate(example(NaturalFrequency))
+    suspicious = Diagnosis("baseline", (), suspect="gain of y1 or of y2")
+    evaluation = Evaluation(suspicious, {}, (), (), None, modes=(frequency,))
+    assert evaluation.unlike_healthy == ""
+    moved = frequency.model_copy(update={"verdict": "changed"})
+    assert replace(evaluation, modes=(moved,)).unlike_healthy == moved.text
 
 
 @pytest.mark.long  # in short, a wrong gain is no change of a parameter
