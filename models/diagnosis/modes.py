@@ -35,7 +35,6 @@ _GROWTH = 0.025
 CONFIRMED = -1
 _REACH = 0.15  # largest relative change for which the mode is looked for
 MOST_LIMIT = 0.1  # a mode whose limit is wider says nothing
-_SPEED_TOLERANCE = 0.03
 _FEWEST_WINDOWS = 4
 _LAGS_S, _COLUMNS = 0.45, 48
 _ORDERS = range(10, 41, 3)
@@ -139,13 +138,7 @@ class HealthyModes(BaseModel, extra="forbid", frozen=True, strict=True):
     def _not_comparable(self, window: WindowStatistics) -> str:
         if missing := [state for state in self.states if state not in window.states]:
             return f"not measured: {', '.join(missing)}"
-        if self.speed_rad_s is not None:
-            (slowest, fastest), now, rpm = self.speed_rad_s, window.speed_rad_s, 30 / math.pi
-            if not math.isfinite(now):
-                return "its speed is not known"
-            if not slowest * (1 - _SPEED_TOLERANCE) <= now <= fastest * (1 + _SPEED_TOLERANCE):
-                return f"speed {now * rpm:.0f} rpm, commissioned at {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
-        return ""
+        return "" if self.speed_rad_s is None else window.speed_beyond(*self.speed_rad_s)
 
     def _by_growth(self, window: WindowStatistics) -> float:
         """How far frequencies may have moved because motions are larger or smaller than recorded."""

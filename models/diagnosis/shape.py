@@ -38,7 +38,6 @@ _POWER_Z = float(ndtri(0.95))
 _MOST_WINDOWS = 100
 FEWEST_WINDOWS = 4  # least number of healthy windows; six or more are advised, from several recordings
 _DIRECTIONS = 3
-_SPEED_TOLERANCE = 0.03
 _LAG_TOLERANCE_S = 1e-9
 _LEAST_P = 1e-300
 
@@ -102,13 +101,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         lags = np.array(self.lags_s)
         if window.lags_s.shape != lags.shape or np.any(np.abs(window.lags_s - lags) > _LAG_TOLERANCE_S):
             return f"its lags differ from the {len(lags)} lags up to {lags[-1]:g} s that were learned"
-        if self.speed_rad_s is not None:
-            (slowest, fastest), now, rpm = self.speed_rad_s, window.speed_rad_s, 30 / math.pi
-            if not math.isfinite(now):
-                return "its speed is not known"
-            if not slowest * (1 - _SPEED_TOLERANCE) <= now <= fastest * (1 + _SPEED_TOLERANCE):
-                return f"speed {now * rpm:.0f} rpm, commissioned at {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
-        return ""
+        return "" if self.speed_rad_s is None else window.speed_beyond(*self.speed_rad_s)
 
     def _judged(self, one: ShapeSpread, window: WindowStatistics, common: str, rate: float) -> Shape:
         reason = common or ("" if one.channel in window.states else "not measured")

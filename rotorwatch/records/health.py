@@ -96,7 +96,7 @@ class Report(OfMachine):
     natural_frequencies: tuple[NaturalFrequency, ...] = Field(
         default=(),
         exclude_if=lambda value: not value,
-        description="if nothing else shows a change of a stiffness well: whether natural frequencies are those of the "
+        description="where a stiffness is read badly or not at all: whether natural frequencies are those of the "
         "healthy machine; left out otherwise",
         examples=[()],
     )

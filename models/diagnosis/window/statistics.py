@@ -37,6 +37,7 @@ from models.signals.waveform import Waveform, stacked_waveform
 
 _DRIFT = 0.1  # drift of a channel's mean, over its rms, above which every hop's own mean is removed
 _VARIED = 0.06  # relative range of a speed found in the vibration up to which levels at its multiples are taken
+_SAME_SPEED = 0.03  # relative distance from speeds up to which a window is comparable with windows of them
 _BESIDE = 3  # bins on either side of a line between whose means the spectra are interpolated
 _SMOOTH = 0.5  # largest ratio of a drift's squared steps from hop to hop to its squared deviations; 2 by chance
 
@@ -163,6 +164,15 @@ class WindowStatistics:
     def banded_spectrum(self) -> ComplexArray:
         """Sums of the spectra over the bins of `pair_bands`, shape (n_bands, n, n)."""
         return np.asarray(np.add.reduceat(self.spectrum, pair_bands(self.frequencies_hz.size)), dtype=np.complex128)
+
+    def speed_beyond(self, slowest: float, fastest: float) -> str:
+        """Why the window is not comparable with others of these speeds, rad/s; empty if it is."""
+        now, rpm = self.speed_rad_s, 30 / np.pi
+        if not np.isfinite(now):
+            return "its speed is not known"
+        if slowest * (1 - _SAME_SPEED) <= now <= fastest * (1 + _SAME_SPEED):
+            return ""
+        return f"speed {now * rpm:.0f} rpm, commissioned at {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
 
     @property
     def without_lines(self) -> "WindowStatistics":
