@@ -169,7 +169,12 @@ class SequentialTest:
             own[windows * window_hops] = total.blurred(self.settings.systematic)
         own[window_hops] = looks[window_hops]
         self._watch_for_contradiction(own)  # without the shared error, which makes none contradict another
-        every = {hops: look.complete().believed() for hops, look in own.items()}
+        # Sums of windows of two states say nothing of the machine as it is, nor of a change that one window straddles.
+        every = {
+            hops: look.complete().believed()
+            for hops, look in own.items()
+            if hops <= window_hops or self._is_clean(look)
+        }
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
         # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.

@@ -357,6 +357,21 @@ def test_a_window_prevails_over_a_sum_that_names_another_parameter() -> None:
     assert [one.name for one in verdict.changed] == ["e"]
 
 
+def test_after_a_repair_a_whole_window_prevails_over_sums_that_reach_back() -> None:
+    """The force has another direction since, so what windows of both states sum to is no machine's reading."""
+    hop_ns, count = 5_000_000_000, 24
+    test = SequentialTest(replace(SETTINGS, short_hops=()))
+    before, after = information(0.02, -0.6) / 12, information(0.03, 0.75) / 12
+    hops = [(before @ true(e=0.35), before)] * 30 + [(0 * true(), after)] * (12 + count)
+    verdicts = []
+    for end in range(12, len(hops) + 1):
+        vectors, informations = (np.array(one) for one in zip(*hops[end - 12 : end], strict=True))
+        window = Stretch((end - 12) * hop_ns, end * hop_ns, vectors.sum(axis=0), informations.sum(axis=0))
+        verdicts.append(test.update({12: window}))
+    assert [one.name for one in verdicts[18].changed] == ["e"]
+    assert [(one.text, one.detected) for one in verdicts[-count:]] == [("nothing has changed", False)] * count
+
+
 def test_sums_do_not_span_a_gap() -> None:
     test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
     play(test, hops, (24, true()))
