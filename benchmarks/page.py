@@ -33,7 +33,7 @@ from page_plant import Plant, told
 from playwright.sync_api import Browser, CDPSession, sync_playwright
 from running_monitor import PLACE, Monitor, monitor
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 EVERY_S = 15.0
 STREAM = f"/api/v1/events?detail=overview&in_full={PLACE}"
 MANY_STREAMS = {"ROTORWATCH_ACCESS__LIMITS__STREAMS_PER_CALLER": "100"}

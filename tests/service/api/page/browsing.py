@@ -26,7 +26,7 @@ from service.settings.service import MachineEntry
 from simulator.scenario import parse_fault
 from tests.service.rig.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = [
     "--no-sandbox",  # tests may run as root
     "--disable-gpu",
