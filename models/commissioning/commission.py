@@ -350,6 +350,7 @@ def _report(
         if learned.diagnoses
         else ()
     )
+    evaluable = [one.name for one in parameters if one.evaluable]
     verdict: Literal["commissioned", "limited", "refused"] = "refused"
     growths: Iterable[GrowthToAlert] = ()
     if commissioned is not None:
@@ -362,7 +363,7 @@ def _report(
         level=knowledge.level,
         level_text=knowledge.text,
         verdict=verdict,
-        summary=_summary(machine, verdict, checks, [one.name for one in parameters if one.evaluable]),
+        summary=_summary(machine, verdict, checks, evaluable, modes=learned.modes is not None),
         version=0 if commissioned is None else commissioned.version,
         identity=None if commissioned is None else commissioned.identity,
         healthy_s=healthy_s,
@@ -401,12 +402,15 @@ def _misfit_notes(commissioned: Commissioned | None) -> tuple[str, ...]:
     )
 
 
-def _summary(machine: MachineFile, verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) -> str:
+def _summary(
+    machine: MachineFile, verdict: str, checks: Sequence[Check], evaluable: Sequence[str], *, modes: bool
+) -> str:
     refused, limited = ([check for check in checks if check.verdict == each] for each in ("refused", "limited"))
     if verdict == "refused":
         reasons = (f"{check.text}; advice: {check.advice}" for check in refused or limited)
         return "; ".join(reasons) or "nothing could be learned"
-    read = "it can only be told whether a channel has changed" if states_of(machine) else "only levels are compared"
+    seen = "natural frequencies have" if modes else "a channel has"
+    read = f"it can only be told whether {seen} changed" if states_of(machine) else "only levels are compared"
     if evaluable:
         read = f"changes of {', '.join(evaluable)} can be read"
     return f"{read}; limited by: {'; '.join(check.text for check in limited)}" if verdict == "limited" else read

@@ -212,10 +212,11 @@ def _learn_none(machine: MachineFile, pieces: Sequence[HealthyPiece], progress: 
             if shape is None:
                 raise
             check = check_determined([str(error)], only_shapes=True)
-    if shape is None:
-        return Learned((check,))
+    learned = _with_modes(machine, windows, Learned((check,), shape=shape))
+    if shape is None or learned.modes is not None:
+        return learned
     powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
-    return _with_modes(machine, windows, Learned((check, check_shapes(machine, powers, shape.windows)), shape=shape))
+    return replace(learned, checks=(check, check_shapes(machine, powers, shape.windows)))
 
 
 def _with_modes(machine: MachineFile, windows: Sequence[WindowStatistics], learned: Learned) -> Learned:
@@ -244,7 +245,9 @@ def _no_equations(why: str, no_shape: str, advice: str) -> Check:
     """No relation can be learned; `no_shape` says why no channel's shape can be either, empty if it can."""
     if no_shape:
         return Check(name="equations", verdict="refused", text=f"{why}; {no_shape}", advice=advice)
-    text = f"{why}: each channel is at most called changed or not changed, and no part of the machine will be named"
+    text = (
+        f"{why}: at most, a natural frequency or a channel is called changed, and no part of the machine will be named"
+    )
     return Check(name="equations", verdict="limited", text=text, advice=advice)
 
 
@@ -260,9 +263,8 @@ def _with_relations(machine: MachineFile, pieces: Sequence[HealthyPiece], progre
     groups = [pieces]
     baselines = [_baseline(groups[0])]
     agreement = check_recordings(machine, disagreements(baselines[0]), _speeds(pieces))
-    if agreement is not None and agreement.verdict == "limited":
-        groups = _by_speed(pieces)
-        baselines = [_baseline(group) for group in groups]
+    if agreement is not None and agreement.verdict == "limited" and len(by_speed := _by_speed(pieces)) > 1:
+        groups, baselines = by_speed, [_baseline(group) for group in by_speed]
     read: list[Read] = []
     compared: list[Read] = []
     for group, baseline in zip(groups, baselines, strict=True):
@@ -334,8 +336,10 @@ def _speeds(pieces: Sequence[HealthyPiece]) -> dict[str, float]:
 
 
 def _by_speed(pieces: Sequence[HealthyPiece]) -> list[list[HealthyPiece]]:
-    """Pieces in groups of one speed, slowest first."""
+    """Pieces in groups of one speed, slowest first; in a single one if a speed is not known."""
     speeds = _speeds(pieces)
+    if not all(map(math.isfinite, speeds.values())):
+        return [list(pieces)]
     groups: list[list[HealthyPiece]] = []
     last = -np.inf
     for name in sorted(speeds, key=speeds.__getitem__):

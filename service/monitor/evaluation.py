@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from models.diagnosis.baseline.diagnostician import OTHER_FORCE, BaselineDiagnostician
 from models.diagnosis.misfit import Rival
 from models.diagnosis.readings import Diagnosis, Left, no_reading
 from models.diagnosis.sensors.disagreement import is_drift
@@ -24,7 +25,7 @@ from models.machine import Operation
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.sensor_faults import FaultKind
-from rotorwatch.records.windows import Equation, NaturalFrequency, Opinion, Parameter, SensorFault, Shape
+from rotorwatch.records.windows import Equation, NaturalFrequency, Opinion, Parameter, SensorFault, Shape, Verdict
 
 _OR_STIFFNESS = "or the stiffness there has changed, which looks the same well below its resonance"
 _TOO_LITTLE = "something changed within the window, and data since then are too few to say what"
@@ -63,7 +64,7 @@ class Evaluation:
             return HealthState.WARMING
         if self.deciding.evaluable:
             return HealthState.HEALTHY
-        states = {shape.verdict for shape in self.shapes}
+        states = {*(one.verdict for one in self.shapes), *(one.verdict for one in self.modes)}
         if "not changed" in states and "changed" not in states:
             return HealthState.UNCHANGED
         return HealthState.NOT_EVALUABLE
@@ -109,6 +110,11 @@ class Evaluation:
     def _changed(self) -> list[str]:
         judged: tuple[NaturalFrequency | Shape, ...] = (*self.modes, *self.shapes)
         return [one.text for one in judged if one.verdict == "changed"]
+
+    def unfit(self, verdict: Verdict) -> str:
+        """What a verdict of *outside the model* may mean where relations were learned; empty if a suspect is told."""
+        learned = self.deciding.by == BaselineDiagnostician.by and not self.deciding.suspect
+        return OTHER_FORCE if learned and verdict.outside_model else ""
 
     def reason(self, *, told: bool) -> str:
         """Why no parameter could be read, each reason once; shapes that have changed come first.

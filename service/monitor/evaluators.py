@@ -37,7 +37,7 @@ _SHAPE, _ROTATION, _MODES = "shape", "rotation", "modes"
 # many a stretch's misfit must be below its share of the window's to be of another machine than the rest.
 _MOST_MISFIT_Z, _LESS = 2.0, 3.0
 _STRADDLES = "the machine changed within the window: its latest data fit for themselves, all of it together does not"
-_NO_EQUATION = "no equation can be evaluated on this machine; see the result for each channel"
+_NO_EQUATION = "no equation can be evaluated on this machine; natural frequencies or channels are compared instead"
 
 
 def evaluator_for(installed: Installed) -> WindowEvaluator:
@@ -78,8 +78,8 @@ class BaselineEvaluator(WindowEvaluator):
         self._diagnosed = states_of(machine) != ()
         self._lines = commissioned.lines != ()  # without any, relations were learned with all lines left in
         self._modes = commissioned.modes
-        # Where a relation cannot be read in a window, its force is unlike the recorded ones: that changes shapes, too.
-        self._shape = None if commissioned.baselines and commissioned.modes else commissioned.shape
+        # A force unlike the recorded ones changes shapes, too: they are used only where nothing else was learned.
+        self._shape = None if commissioned.baselines or commissioned.modes else commissioned.shape
         self._beyond_ns = (0,) * (0 if self._modes is None else len(self._modes.modes))
         self._length_s, self._on_delay_ns = machine.window_data_s, round(machine.alarms.on_delay_s * 1e9)
         self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate

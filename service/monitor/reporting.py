@@ -122,7 +122,13 @@ class WindowReporter:
         astride_s = test.astride_s if evaluation.alone and not foreign.text else 0.0
         verdict, rival = self._beside_rivals(verdict)
         explains = self._alarms.found(
-            verdict, test.unexplained, deciding.suspect, end_ns, astride_s, hidden=foreign.hides, rival=rival
+            verdict,
+            test.unexplained or evaluation.unfit(verdict),
+            deciding.suspect,
+            end_ns,
+            astride_s,
+            hidden=foreign.hides,
+            rival=rival,
         )
         levels.tell(self._alarms, end_ns, faulty=faulty, explained=explains)
         if evaluation.shapes or evaluation.modes:

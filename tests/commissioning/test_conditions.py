@@ -84,13 +84,25 @@ def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     assert "at one speed" in text
 
 
-@pytest.mark.parametrize(("by", "verdict"), [(-0.03, "passed"), (0.03, "passed"), (-0.04, "refused")])
-def test_a_difference_that_matters_to_no_alarm_is_no_reason_to_refuse(by: float, verdict: str) -> None:
+@pytest.mark.parametrize(
+    ("differing", "verdict"),
+    [
+        ({"k_by": -0.03}, "passed"),
+        ({"k_by": 0.03}, "passed"),
+        ({"k_by": -0.04}, "refused"),
+        ({"k_by": -0.2, "c_by": 0.3}, "refused"),
+        ({"c_by": 2.4, "k_by": 0.01}, "limited"),
+    ],
+)
+def test_a_difference_is_a_reason_to_refuse_only_if_it_matters_and_stiffness_differs(
+    differing: dict[str, float], verdict: str
+) -> None:
     """With one source a difference of one per cent may be four standard errors; k_by is reported from 10 % on."""
     at_one_speed = {"monday.mcap": 138.2, "friday.mcap": 138.2}
-    found = check_recordings(NOTHING, [("k_by", by, "friday.mcap: it differs")], at_one_speed)
-    assert sure(found).verdict == verdict
-    assert sure(found).text.startswith("friday.mcap: it differs")
+    found = [(name, by, f"friday.mcap: {name} differs") for name, by in differing.items()]
+    check = sure(check_recordings(NOTHING, found, at_one_speed))
+    assert check.verdict == verdict
+    assert check.text.startswith("friday.mcap: ")
 
 
 DRAW = Draw(LAB, 7_700_077, Purpose.EVALUATION, stream=0, layout=Layout.ONE_SOURCE)

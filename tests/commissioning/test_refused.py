@@ -266,7 +266,7 @@ def test_without_equations_channels_are_only_judged_changed_or_not() -> None:
     made = made_of(blocks, machine)
     verdict, text, advice = told_of(made, "equations")
     assert verdict == "limited"
-    assert "changed or not changed" in text
+    assert "at most, a natural frequency or a channel is called changed" in text
     assert "at the disc" in advice
     learned = sure(made.commissioned)
     assert (learned.baselines, learned.shape is None) == ((), False)
@@ -282,7 +282,9 @@ def test_a_rate_too_low_for_equations_leaves_only_channel_shapes() -> None:
     made = made_of(blocks, machine)
     verdict, text, advice = told_of(made, "equations")
     assert verdict == "limited"
-    assert text.startswith("a sampling rate of 500 Hz allows no equation: each channel is at most called changed")
+    assert text.startswith(
+        "a sampling rate of 500 Hz allows no equation: at most, a natural frequency or a channel is called changed"
+    )
     assert advice == "sample at 794 Hz or faster"
     assert sure(made.commissioned).shape is not None
 

@@ -72,6 +72,11 @@ _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
 _GONE = -0.95  # a loss beyond this is not a real change of a bearing
 _SURELY_OUTSIDE = 8.0
+OTHER_FORCE = (
+    "either another force drives the machine than in commissioning (then record a healthy condition like this one), or "
+    "something has changed that no parameter describes"
+)
+"""What a misfit of learned relations may mean."""
 # Factor on the standard errors of the bearing's parameters in windows with another force, for a relation learned in one
 # condition: its error is not normal (decision 0012).
 _OTHER_FORCE = 1.2
@@ -178,11 +183,11 @@ class BaselineDiagnostician:
             misfit_z=_misfit(changes),
         )
         # The variance that allows for another force is left out here: it must not make a reading impossible.
-        impossible = foreign or _impossible(
+        unlike = foreign or impossible(
             diagnosis, dict(zip(self._names, np.diag(bearing.noise + bearing.common), strict=True))
         )
-        if impossible:
-            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), unexplained=impossible)
+        if unlike:
+            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), unexplained=unlike)
         z, suspect = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else (0.0, "")
         if not suspect:
             abstains = self._one_condition and not same
@@ -338,21 +343,24 @@ def _unexplained(misfit_z: float | None) -> str:
     text, limit = beyond(misfit_z, _SURELY_OUTSIDE)
     return (
         f"the learned relations do not hold here: their remainder is {text} standard errors more than "
-        f"chance leaves, limit for a reading {limit}; either another force drives the machine than in commissioning "
-        "(then record a healthy condition like this one), or something has changed that no parameter describes"
+        f"chance leaves, limit for a reading {limit}; {OTHER_FORCE}"
     )
 
 
-def _impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
+def impossible(diagnosis: Diagnosis, variances: Mapping[str, float]) -> str:
     """Sentence on a stiffness or damping that has vanished or changed sign, or a stiffness of unknown size, else "".
 
     The variances are those of the readings without the allowance for another force.
     """
+    unfit = (diagnosis.misfit_z or 0.0) > _SURELY_OUTSIDE
     for reading in diagnosis.evaluable:
         if reading.name == "e" or reading.relative_change is None or reading.standard_error is None:
             continue
         gone = reading.relative_change + 2 * reading.standard_error < _GONE
-        if gone or (reading.name.startswith("k") and variances[reading.name] > LOST**2):
+        # A reversed sensor makes nearly any stiffness fit, best one of the other sign; a force that hardly moves the
+        # bearing does not, although the relation may not quite hold under it.
+        lost = reading.name.startswith("k") and variances[reading.name] > LOST**2
+        if gone or (lost and (unfit or abs(reading.relative_change) > LOST)):
             return f"{reading.name} is impossible, as if a sensor of this plane were swapped, reversed or delayed"
     return ""
 

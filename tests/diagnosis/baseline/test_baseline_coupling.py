@@ -11,10 +11,11 @@ from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_
 from benchmarks.studies.subjects.machines import subject_named
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.conditions import Growth
-from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, impossible
 from models.diagnosis.baseline.learned import learn_baseline, planes_coupled
 from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS
 from models.diagnosis.baseline.stored import Baseline
+from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window.statistics import WindowStatistics
 from models.errors import EstimationError
@@ -201,3 +202,15 @@ def test_a_reversed_sensor_is_suspected_even_in_a_hardly_determined_plane() -> N
 
     diagnosis = BaselineDiagnostician(learned).diagnose(*windows_under(rotor, run, 1, 99, reversed_))
     assert "swapped, reversed or delayed" in diagnosis.unexplained
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "misfit_z", "told"),
+    [(-0.02, 0.54, 4.0, False), (-0.02, 0.54, 9.0, True), (-2.0, 36.0, 3.9, True), (-0.97, 0.005, 0.0, True)],
+)
+def test_a_stiffness_that_a_new_force_does_not_determine_is_not_called_impossible(
+    change: float, error: float, misfit_z: float, *, told: bool
+) -> None:
+    """A random finite-element rotor under a force in another direction than the recorded ones; a reversed sensor."""
+    diagnosis = Diagnosis("baseline", (parameter_reading("k_by", "baseline", change, error),), misfit_z=misfit_z)
+    assert ("swapped, reversed or delayed" in impossible(diagnosis, {"k_by": error**2})) is told

@@ -23,7 +23,7 @@ from models.signals.channels import Sensor
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState, Report
-from rotorwatch.records.windows import NaturalFrequency
+from rotorwatch.records.windows import NaturalFrequency, Verdict
 from service.monitor.evaluation import Evaluation
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
@@ -388,6 +388,8 @@ def test_where_no_equation_can_be_evaluated_a_natural_frequency_shows_a_softer_b
         one.natural_frequencies for one in later
     ]
     windows, events = [*windows, *later], [*events, *told]
+    assert full(windows)[0].state is HealthState.UNCHANGED
+    assert not any(window.shapes for window in windows)  # another force changes them as well
     verdicts = [{one.verdict for one in window.natural_frequencies} for window in full(windows)]
     assert not any("changed" in found for found in verdicts[:5])  # these share data with the first window
     assert "changed" in verdicts[-1]
@@ -402,6 +404,15 @@ def test_what_a_reading_makes_suspect_is_no_changed_natural_frequency() -> None:
     assert evaluation.unlike_healthy == ""
     moved = frequency.model_copy(update={"verdict": "changed"})
     assert replace(evaluation, modes=(moved,)).unlike_healthy == moved.text
+
+
+def test_a_misfit_of_learned_relations_may_be_another_force() -> None:
+    unfit = Verdict.model_validate(example(Verdict)).model_copy(update={"outside_model": True})
+    evaluation = Evaluation(Diagnosis("baseline", ()), {}, (), (), None)
+    assert "another force drives the machine than in commissioning" in evaluation.unfit(unfit)
+    assert evaluation.unfit(unfit.model_copy(update={"outside_model": False})) == ""
+    for other in (Diagnosis("likelihood", ()), Diagnosis("baseline", (), suspect="gain of y1 or of y2")):
+        assert replace(evaluation, deciding=other).unfit(unfit) == ""
 
 
 @pytest.mark.long  # in short, a wrong gain is no change of a parameter
