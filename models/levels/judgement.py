@@ -91,7 +91,7 @@ class LevelJudge:
         self._blank = [_blank(plan, channel) for channel in channels]
         self._reference: LevelReference | None = None
         # Caches of what most windows have in common with the one before.
-        self._relatives: dict[tuple[int, bool, int], RelativeLimits] = {}
+        self._relatives: dict[tuple[object, ...], RelativeLimits] = {}
         self._limits: dict[tuple[object, ...], dict[str, _Nearest]] = {}
         self._growth = lru_cache(maxsize=16 * len(self._channels))(
             lambda source, alert: _nearest_limits("growth", [Limit(source, False, alert)])
@@ -357,10 +357,10 @@ class LevelJudge:
         if reference is not self._reference:
             self._reference, self._relatives = reference, {}
             self._limits.clear()
-        state, seen = reference.at(levels.speed_rad_s)
-        alike = (id(state), seen, levels.hops)  # unique while the reference is kept
+        every = reference.at(levels.speed_rad_s), *reference.passed(levels)  # unique while the reference is kept
+        alike = (levels.hops, (levels.speed_rad_s or 0.0) < 0, *((id(state), seen) for state, seen in every))
         if alike not in self._relatives:
-            self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings)
+            self._relatives[alike] = relative_limits(levels, reference, self._channels, self._settings, every)
         return self._relatives[alike]
 
     def _judged_limits(

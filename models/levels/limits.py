@@ -10,7 +10,7 @@ A limit of a machine file on a level that its sensors can never give would guard
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -75,10 +75,39 @@ class RelativeLimits:
 
 
 def relative_limits(
-    levels: WindowLevels, reference: LevelReference, channels: Sequence[Channel], given: LevelSettings
+    levels: WindowLevels,
+    reference: LevelReference,
+    channels: Sequence[Channel],
+    given: LevelSettings,
+    states: Sequence[tuple[OperatingState, bool]],
 ) -> RelativeLimits:
-    """Relative limits of a window, and of all others with as many hops in the same operating state."""
-    state, seen = reference.at(levels.speed_rad_s)
+    """Relative limits of a window, and of all others with as many hops in the same operating states and sense.
+
+    The first of `states` is that of the mean speed; any others are those that the machine passed through, each with
+    whether it ran at such a speed when it was learned. The levels of such a window are a mixture, in which those of one
+    speed may be many times those of the mean speed: of each level, the farthest limit counts, and 1x has no region.
+    """
+    mean, *passed = (_limits_at(levels, reference, channels, given, at) for at in states)
+    if not passed:
+        return mean
+    limits = []
+    for column in range(len(channels)):
+        every = [one.limits[column] for one in passed]
+        shared = set(every[0]).intersection(*every[1:])
+        limits.append({name: _farthest([one[name] for one in every]) for name in every[0] if name in shared})
+    return RelativeLimits(mean.source, tuple(limits), (None,) * len(limits), mean.bands)
+
+
+def _limits_at(
+    levels: WindowLevels,
+    reference: LevelReference,
+    channels: Sequence[Channel],
+    given: LevelSettings,
+    at: tuple[OperatingState, bool],
+) -> RelativeLimits:
+    state, seen = at
+    # Turning the other way, the same machine has other phases.
+    same_sense = all(edge * (levels.speed_rad_s or 0.0) > 0 for edge in state.speed_rad_s or ())
     source = reference.source if seen else f"{reference.source} at another speed"
     shorter = _shorter(state, levels.hops)
     limits, regions = [], []
@@ -99,7 +128,7 @@ def relative_limits(
                 fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
             shown = [shown_level(channel, name, edge) for edge in (alert, danger, fall)]
             of_channel[name] = Limit(source, False, *shown)
-            if seen and name == "x1" and one.vector is not None:
+            if seen and same_sense and name == "x1" and one.vector is not None:
                 region = _region(channel, one, complex(*one.vector), alert, shorter)
         limits.append(of_channel)
         regions.append(region)
@@ -108,6 +137,11 @@ def relative_limits(
         own = [state.bands.get(channel.name) for channel in channels]
         bands = band_limits(levels.bands, own, given.alert_ratio, shorter)
     return RelativeLimits(source, tuple(limits), tuple(regions), bands)
+
+
+def _farthest(limits: Sequence[Limit]) -> Limit:
+    danger, fall = max(one.danger for one in limits), min(one.fall for one in limits)
+    return replace(max(limits, key=lambda one: one.alert), danger=danger, fall=fall)
 
 
 def _region(channel: Channel, one: ReferenceLevel, centre: complex, alert: float, shorter: float) -> Region:

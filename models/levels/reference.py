@@ -13,7 +13,7 @@ from models.errors import CheckpointError
 from models.levels.bands import NEIGHBOURHOOD, BandLevels, BandReference, learn_bands
 from models.levels.kurtosis import HopReference, learn_hops
 from models.levels.lines import expected_lines, learn_lines
-from models.levels.measures import COMPARED, WindowLevels
+from models.levels.measures import COMPARED, STANDS_RAD_S, WindowLevels
 from models.levels.places import GainReference
 from models.signals.block import FloatArray
 
@@ -98,6 +98,14 @@ class LevelReference(BaseModel, extra="forbid", frozen=True, strict=True):
 
         nearest = min(alike, key=distance)
         return nearest, distance(nearest) <= _SAME_SPEED
+
+    def passed(self, levels: WindowLevels) -> tuple[tuple[OperatingState, bool], ...]:
+        """The states at whose speeds the machine turned in the window, each as by `at`; empty if it was one only."""
+        if levels.speeds_rad_s is None or len(self.states) < 2:
+            return ()
+        found = [self.at(speed) for speed in levels.speeds_rad_s.tolist() if abs(speed) > STANDS_RAD_S]
+        several = len({id(state) for state, _ in found}) > 1
+        return tuple({(id(one[0]), one[1]): one for one in found}.values()) if several else ()
 
 
 def learn_levels(

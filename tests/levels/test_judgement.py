@@ -161,11 +161,26 @@ def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() 
         assert (found.state, found.source) == ("alert", "1x vector")
 
 
+def test_a_1x_vector_is_compared_in_the_sense_of_rotation_in_which_it_was_learned() -> None:
+    healthy = reference(*(window(x1=10e-6 * np.exp(1j * turn)) for turn in (-0.05, 0.0, 0.05)), channel=SHAFT)
+    reversed_ = limits(judged(SHAFT, window(x1=-10e-6, speed_rad_s=-SPEED), healthy))["x1"]
+    assert (reversed_.state, reversed_.source) == ("normal", "commissioned")
+    louder = limits(judged(SHAFT, window(x1=-17e-6, speed_rad_s=-SPEED), healthy))["x1"]
+    assert louder.state == "alert"
+
+
 def test_levels_are_shown_in_five_digits_as_python_formats_them() -> None:
     values = np.random.default_rng(20261125).standard_normal((100, 30)) * 10.0 ** np.arange(-14, 16)
     values[0, :4] = 0.0, np.nan, np.inf, -np.inf
     shown = [[float(f"{one:.5g}") if np.isfinite(one) else None for one in row] for row in values.tolist()]
     assert all_rounded(values) == shown
+
+
+def fast_and_slow(healthy: LevelReference, speeds: list[float], overall: float) -> str:
+    """State of an overall level in a window through which the speed has passed from the first to the last."""
+    hops = replace(window(speed_rad_s=float(np.mean(speeds)) * SPEED, overall=overall), hops=len(speeds))
+    found = judged(CASING, replace(hops, speeds_rad_s=SPEED * np.array([*speeds, np.nan])), healthy)
+    return limits(found)["overall"].state
 
 
 def test_every_operating_state_has_levels_of_its_own() -> None:
@@ -180,6 +195,10 @@ def test_every_operating_state_has_levels_of_its_own() -> None:
     )
     assert (fast.state, slow.state, between.state) == ("normal", "danger", "alert")
     assert between.source == "commissioned at another speed"
+    assert fast_and_slow(healthy, [2.0, 1.5, 0.5], 4.5e-3) == "normal"  # as loud as it was at its first speed
+    assert fast_and_slow(healthy, [2.0, 1.5, 0.5], 7e-3) == "alert"
+    assert fast_and_slow(healthy, [1.1, 1.0, 0.9], 4.5e-3) == "danger"
+    assert fast_and_slow(healthy, [2.0, 2.0, 1.0, 1.0], 1.2e-3) == "normal"  # not silent
     # A machine that runs down through unknown speeds has not fallen silent.
     healthy = reference(*(window(speed_rad_s=SPEED, overall=value) for value in (1e-3, 1.1e-3)))
     quiet = (limits(judged(CASING, window(speed_rad_s=speed, overall=1e-4), healthy)) for speed in (SPEED, SPEED / 2))
