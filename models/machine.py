@@ -80,7 +80,9 @@ class AlarmLimits(BaseModel, extra="forbid", frozen=True):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if not self.clear_below < self.raise_above < self.danger_above:
-            got = f"{self.clear_below}, {self.raise_above}, {self.danger_above}"
+            names = ("clear_below", "raise_above", "danger_above")
+            default = {name: "" if name in self.model_fields_set else " (default)" for name in names}
+            got = ", ".join(f"{getattr(self, name)}{default[name]}" for name in names)
             raise ValueError(f"expected clear_below < raise_above < danger_above, got {got}")
         return self
 

@@ -294,6 +294,8 @@ def unmeasured(
 def _missing(plan: LevelPlan, column: int, measure: str, *, turning: bool) -> str | None:
     """Why a channel has no such level; None if it has."""
     wanted = _QUANTITIES.get(measure, ())
+    if measure == "velocity" and plan.quantities[column] is Quantity.VELOCITY:
+        return ": the rms velocity of a velocity sensor is its overall"
     if wanted and plan.quantities[column] not in wanted:
         return f": it is a {plan.quantities[column].value}, expected {' or '.join(one.value for one in wanted)}"
     if measure in {"high", "envelope"} and plan.high_hz is None:

@@ -124,6 +124,10 @@ class LevelSettings(BaseModel, extra="forbid", frozen=True):
             raise ValueError(f"zones: {', '.join(self.zones)}: one for the casing and one for the shaft at most")
         if self.band_hz is not None and not self.band_hz[0] < self.band_hz[1]:
             raise ValueError(f"band_hz {self.band_hz} must be 0 < from < to")
+        for kind in ("alert", "danger"):
+            given = [(one.channel, one.measure) for one in self.limits if getattr(one, kind) is not None]
+            if twice := next((one for one in given if given.count(one) > 1), None):
+                raise ValueError(f"limits: {kind} of {' '.join(twice)} is given twice; is another channel meant?")
         if self.alert_ratio >= self.danger_ratio:
             raise ValueError(f"alert_ratio {self.alert_ratio:g} must be below danger_ratio {self.danger_ratio:g}")
         return self
