@@ -320,6 +320,7 @@ def _only_levels(machine: MachineFile, text: str) -> Check:
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
     advice = "record longer, at more than one speed or load, while something besides the unbalance excites the machine"
     if level is not KnowledgeLevel.NONE:
+        advice = f"check every value and unit in [rotor], above all masses and shaft; or {advice}"
         advice += f"; {NO_SUCH_ROTOR}"
     return Check(name="can be learned", verdict="refused", text=f"at level {level}: {text}", advice=advice)
 

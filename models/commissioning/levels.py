@@ -69,6 +69,7 @@ _OPPOSITE = (
     "gyroscopic moments have the sense in which natural frequencies of forward whirl rise with the speed; "
     "in the other one, which is tried first, the machine file does not explain the recordings"
 )
+_VALUES = "values in the machine file"
 _NO_CHANCE = 3.0  # standard errors beyond which an identified value is not the file's
 _WELL = 0.03  # standard error of a stiffness up to which its reading shows more than natural frequencies do
 _TEXT_OF = {"y": "horizontal", "z": "vertical"}
@@ -388,23 +389,58 @@ def learn(level: KnowledgeLevel, machine: MachineFile, pieces: Sequence[HealthyP
         if all(check.verdict == "passed" for check in found[-1].checks):
             break
     best = min(found, key=_doubt, default=None)  # the first sense if both are equally good
-    if best is None or (best.gyroscopic == "opposite" and _doubt(best) == _REFUSED):
+    refused = best is None or _doubt(best) == _REFUSED
+    otherwise = _identified_otherwise(machine, pieces, progress) if refused and isinstance(machine, Machine) else ()
+    if best is None or (best.gyroscopic == "opposite" and refused):
+        if otherwise:
+            return Learned(otherwise)
         raise errors[0]
+    best = replace(best, checks=(*best.checks, *otherwise))
     if level is KnowledgeLevel.PARTIAL:
         best = replace(best, checks=(*best.checks, *_not_as_given(machine, best), *_units_in_doubt(best)))
     return best if best.gyroscopic == "Eq. 27" else replace(best, notes=(*best.notes, _OPPOSITE))
 
 
+def _identified_otherwise(machine: Machine, pieces: Sequence[HealthyPiece], progress: Progress) -> tuple[Check, ...]:
+    """Check that gives the values that a file which is refused has wrong; empty if its masses and shaft do not fit.
+
+    One window of each recording, or two of the only one, are enough to find a wrong unit.
+    """
+    rotor = machine.rotor.model_dump(exclude={FAULT_FIELDS[name] for name in PARAMETERS if name != "EI"})
+    less = MachineFile.model_validate(machine.model_dump() | {"rotor": rotor})
+    first = list({piece.recording: piece for piece in reversed(pieces)}.values())
+    try:
+        learned = learn(KnowledgeLevel.PARTIAL, less, first if len(first) > 1 else pieces[:2], progress)
+    except EstimationError:
+        return ()
+    if learned.machine is None or _doubt(learned) == _REFUSED:
+        return ()
+    found = learned.machine.rotor
+    fields = [FAULT_FIELDS[name] for name in _not_given(machine, learned)]
+    told = [f"{field} {getattr(found, field):.3g} instead of {getattr(machine.rotor, field):.3g}" for field in fields]
+    if not told:
+        return ()
+    text = f"with its masses and shaft, the recordings are those of a rotor with {', '.join(told)}"
+    advice = "look for a wrong unit, or values that were exchanged; correct them, or leave them out of [rotor]"
+    return (Check(name=_VALUES, verdict="refused", text=text, advice=advice),)
+
+
+def _not_given(machine: MachineFile, learned: Learned) -> dict[str, float]:
+    """Parameters that the recordings contradict, with their relative difference from what the file gives."""
+    record, found = learned.identified, dict[str, float]()
+    if machine.rotor is None or learned.machine is None or record is None:
+        return found
+    for name, variance in zip(PARAMETERS, np.diag(record.matrix()).tolist(), strict=True):
+        given, identified = (getattr(rotor, FAULT_FIELDS[name]) for rotor in (machine.rotor, learned.machine.rotor))
+        by = 0.0 if given is None or name not in record.names else identified / given - 1
+        if abs(by) > max(MATTERS * machine.alarms.for_parameter(name).raise_above, _NO_CHANCE * math.sqrt(variance)):
+            found[name] = by
+    return found
+
+
 def _not_as_given(machine: MachineFile, learned: Learned) -> tuple[Check, ...]:
     """Check that names what the file gives and the recordings contradict; empty without."""
-    record, told = learned.identified, []
-    if machine.rotor is None or learned.machine is None or record is None:
-        return ()
-    for name, variance in zip(PARAMETERS, np.diag(record.matrix()).tolist(), strict=True):
-        given, found = (getattr(rotor, FAULT_FIELDS[name]) for rotor in (machine.rotor, learned.machine.rotor))
-        by = 0.0 if given is None or name not in record.names else found / given - 1
-        if abs(by) > max(MATTERS * machine.alarms.for_parameter(name).raise_above, _NO_CHANCE * math.sqrt(variance)):
-            told.append(f"{PARAMETER_TEXT[name]} ({name}) {by:+.0%}")
+    told = [f"{PARAMETER_TEXT[name]} ({name}) {by:+.0%}" for name, by in _not_given(machine, learned).items()]
     if not told:
         return ()
     text = f"identified otherwise than the machine file gives, and used as identified: {', '.join(told)}"
@@ -412,7 +448,7 @@ def _not_as_given(machine: MachineFile, learned: Learned) -> tuple[Check, ...]:
         "correct these values in [rotor], or leave out those of the bearing and e_m; if you know them for certain, "
         "masses or dimensions are not those of the machine: weigh and measure again"
     )
-    return (Check(name="values in the machine file", verdict="limited", text=text, advice=advice),)
+    return (Check(name=_VALUES, verdict="limited", text=text, advice=advice),)
 
 
 def _units_in_doubt(learned: Learned) -> tuple[Check, ...]:

@@ -105,6 +105,7 @@ RUNNING_AWAY = Event(at_s=30.0, ramp_s=10.0, speed_rpm=2 * LAB.operation.speed_r
 SOFTENING = Event(at_s=45.0, parameter="k_by", relative_change=-0.3)
 SOFTER = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"k_by_N_per_m": 4.4e4})})
 THICK = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"shaft_diameter_m": 0.03})})
+PER_MM = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"k_by_N_per_m": 50.0, "k_bz_N_per_m": 60.0})})
 COARSE = NOTHING.model_copy(update={"window": NOTHING.window.model_copy(update={"lag_step_s": 0.0025})})
 SWAPPED = "refused: .*y1 and z1 are swapped, or y2 and z2: bearing and disc move together across the planes"
 NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the wrong sign.* state delay_us"
@@ -145,6 +146,10 @@ NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the 
         }),
         (no_such_rotor, {"can be learned": r"refused: .*; .*leave \[rotor\] out of the machine file"}),
         (lambda: made_of(stream(45.0, 43), THICK), {"can be learned": r"refused: .*; .*leave \[rotor\] out of the"}),
+        (lambda: made_of(stream(45.0, 43), PER_MM), {
+            "values in the machine file":
+                r"refused: .*k_by_N_per_m 4.*e\+04 instead of 50, k_bz_N_per_m .*e\+04 instead of 60.*wrong unit",
+        }),
         (lambda: of_displacements(("z1", "y1", "y2", "z2", "theta")), {"sensors": SWAPPED}),
         (lambda: of_displacements(("y1", "z1", "z2", "y2", "theta")), {"sensors": SWAPPED}),
         pytest.param(
@@ -154,8 +159,8 @@ NO_RELATION = "sensors of bearing and disc are not exchanged, that none has the 
     ],
     ids=[
         *("too short", "gaps", "clipped", "stuck", "angle that falls", "speed runs away", "grows", "changed meanwhile"),
-        *("another machine", "window", "no such rotor", "nor by its file", "swapped at 1", "swapped at 2"),
-        *("exchanged", "wrong sign"),
+        *("another machine", "window", "no such rotor", "nor by its file", "another unit"),
+        *("swapped at 1", "swapped at 2", "exchanged", "wrong sign"),
     ],
 )  # fmt: skip
 def test_an_unfit_recording_is_refused_with_advice(make: Callable[[], Commissioning], told: dict[str, str]) -> None:
