@@ -154,6 +154,8 @@ def status(
             str(health.quality.gaps),
         )
         remarks += [f"{place}: {health.reason}"] if health.reason else []
+        differs = "; ".join(health.stream.descriptor_mismatch)
+        remarks += [f"{place}: the publisher's channel descriptor differs from the file: {differs}"] if differs else []
         growth = None if health.report is None else health.report.level_growth
         remarks += [] if growth is None else [f"{place}: {growth.text}"]
         remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]

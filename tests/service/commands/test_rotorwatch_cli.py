@@ -137,8 +137,10 @@ def test_status_distinguishes_stopped_data_from_an_alarm(tmp_path: Path) -> None
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "a block")
         until(lambda: "stream-lost" in {one.name for one in worker.alarms().alarms if one.raised}, "the silence")
-        found = run("status", "--url", runtime.http_url, "--json")
-    assert found.returncode == 3
+        worker.descriptor(worker.machine.descriptor.model_dump_json().replace('"um"', '"mm"', 1).encode())
+        found, table = (run("status", "--url", runtime.http_url, *more) for more in (["--json"], []))
+    assert "differs from the file: channels.0.unit (y1) is 'mm', expected 'um'" in table.stdout
+    assert found.returncode == table.returncode == 3
     said = json.loads(found.stdout)
     assert said["summary"] == "no-data"
     assert said["machines"][0]["reason"].startswith("no data since 20")
