@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.window.excluded import KnownLine
 from models.diagnosis.window.lines import Line, steady_lines
 from models.diagnosis.window.moments import HopMoments, Plan, plan_for
@@ -112,6 +113,9 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
         If it cannot be read, or holds no stream of this machine; the message names the streams that it holds.
     """
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
+    if found.refused and (announced := next(read_recording(path, keys={machine.keys.descriptor}), None)):
+        differs = "; ".join(descriptor_mismatch(announced.payload, machine))
+        found = replace(found, last_refusal=differs or found.last_refusal)
     if not found.hops and not found.refused:
         streams = [key for key in summarize_recording(path).messages if key.endswith("/stream")]
         held = ", ".join(streams) or "no stream"

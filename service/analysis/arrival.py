@@ -7,6 +7,7 @@ import numpy as np
 
 from models.arrivals import Senders
 from models.commissioning.commissioned import Installed
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.sensors.missing import MissingNumbers
 from models.diagnosis.window.moments import plan_for
 from models.errors import WireError
@@ -20,7 +21,6 @@ from models.signals.wire import decode_block
 from rotorwatch.records.levels import three_digits
 from service.analysis.revolutions import Excerpt
 from service.monitor.conversion import rfc3339
-from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
 
 _MOST_BREAKS = 3

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, not_read, read_equation, window_view
@@ -18,7 +19,6 @@ from models.signals.block import ComplexArray, FloatArray, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.windows import Equation as EquationReading
 from service.analysis.recorded import Recorded
-from service.monitor.descriptor import descriptor_mismatch
 
 
 @dataclass(frozen=True, slots=True)

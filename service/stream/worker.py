@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 
 from models.commissioning.commissioned import Installed
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import SampleBlock
 from models.signals.keys import Topic
@@ -26,7 +27,6 @@ from service.monitor import conversion
 from service.monitor.alarms.alarm import AlarmEvent, NotInTime, OperatorAction
 from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.conversion import alarm_cloud_event, alarm_entries, alarm_log_page
-from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.recordings.recorder import MachineRecorder

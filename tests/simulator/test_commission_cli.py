@@ -150,6 +150,10 @@ def test_unusable_recordings_and_machine_files_are_refused(folder: Path) -> None
     found = run(folder, "--machine", "other.toml", "--healthy", "monday.mcap", "--out", "never")
     assert found.exit_code == 2
     assert "no hop of 5 s of demo/pump in it; it holds rotorwatch/demo/lab/stream; expected the site" in found.stderr
+    moved = NOTHING_KNOWN.replace('location = "disc"', 'location = "DE"')
+    (folder / "moved.toml").write_text(moved, encoding="utf-8")
+    found = run(folder, "--machine", "moved.toml", "--healthy", "short.mcap", "--out", "never")
+    assert "channels.4.location (y2) is 'disc', expected 'DE'" in " ".join(found.stdout.split())
     (folder / "broken.toml").write_text(NOTHING_KNOWN + "\nnonsense = 1\n", encoding="utf-8")
     found = run(folder, "--machine", "broken.toml", "--healthy", "monday.mcap", "--out", "never")
     assert found.exit_code == 2

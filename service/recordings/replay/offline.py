@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from models.commissioning.commissioned import Installed, install
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.networks.bundle import MANIFEST, SHIPPED_BUNDLES
 from models.errors import MachineFileError, RecordingError
 from models.machine import SHIPPED_MACHINES, MachineFile, load_machine_file
@@ -21,7 +22,6 @@ from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Report
 from rotorwatch.records.replays import OfflineSummary, ParameterLimits, ReplayProgress
 from service.monitor.conversion import alarm_cloud_event
-from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorReport
 from service.recordings.replay.player import Control

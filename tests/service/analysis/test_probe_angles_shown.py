@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.descriptor import descriptor_mismatch
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.machine import load_machine_file
 from models.signals.block import SampleBlock
@@ -18,7 +19,6 @@ from service.analysis.snapshots.orbit import orbit_snapshot
 from service.analysis.snapshots.window import correlation_snapshot, spectrum_snapshot
 from service.commands.installation import init
 from service.monitor.conversion import machine_description
-from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.reports import Identity
 from simulator.scenario import load_scenario
 from simulator.stream import blocks

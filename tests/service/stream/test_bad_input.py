@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from models.descriptor import descriptor_mismatch
 from models.ingest import Reason
 from models.machine import load_machine
 from models.signals.block import SampleBlock
@@ -25,7 +26,6 @@ from rotorwatch.records.windows import SensorFault
 from service.analysis.recorded import Recorded
 from service.analysis.trend import read_trend
 from service.interchange.exported import Table, alarm_table, report_table, stream_table
-from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker

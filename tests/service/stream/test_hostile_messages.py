@@ -15,6 +15,7 @@ import zenoh
 
 from models.alarm_names import CONFLICT, DATA, MODEL, STREAM_LOST, alarm_kind
 from models.commissioning.commissioned import install
+from models.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
 from models.machine import load_machine
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
@@ -23,7 +24,6 @@ from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, enc
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState, Report
-from service.monitor.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.runtime.runtime import running
 from service.stream.inbox import Inbox, RawBlock
