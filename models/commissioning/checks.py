@@ -254,7 +254,7 @@ def check_recordings(
         if matter <= _DAMPINGS:
             return told(
                 verdict="limited",
-                text=f"{text}, at one speed; stiffness is the same, and later intervals allow for what differs",
+                text=f"{text}, at one speed; stiffness agrees, and later intervals allow for what differs",
                 advice=f"if nothing has changed, no damping can be told under every force here; otherwise, {advice}",
             )
         return told(verdict="refused", text=f"{text}, at one speed", advice=advice)

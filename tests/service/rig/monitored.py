@@ -52,6 +52,7 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
         worker = worker_of(runtime)
         send(address, scenario_blocks(78.0, parse_fault("k_by=-0.33@0")), load_machine(file))
         until(lambda: worker.health().quality.accepted_blocks == 780, "all blocks")
+        until(lambda: worker.history.evidence("k_by") is not None, "evidence of the alarm, which another thread keeps")
         yield runtime, worker
 
 
