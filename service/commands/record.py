@@ -18,6 +18,7 @@ from service.commands.running import ConnectOption, LinkOption, ListenOption, ex
 
 if TYPE_CHECKING:  # these import numpy, which would delay --help
     from models.machine import MachineFile
+    from models.signals.link import LinkSettings
     from service.recordings.recorder import MachineRecorder
     from service.settings.service import HistorySettings, RecordingSettings
 
@@ -71,7 +72,7 @@ def record(
         prepare_numerics()
         directory = None if out is None else str(out)
         changes = {"directory": directory, "rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
-        machines, settings, history = _settings(config, machine, changes)
+        machines, settings, history, beside = _settings(config, machine, changes)
         from service.history.shared import committed_events  # noqa: PLC0415  # keeps --help quick
         from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
         from service.settings.service import LogSettings  # noqa: PLC0415
@@ -87,7 +88,7 @@ def record(
         for recorder in recorders:
             recorder.prepare()  # raises at once if the folder cannot be written
         stop = undo.enter_context(stop_request())
-        session = Link(link_of(connect, listen, link))
+        session = Link(link_of(connect, listen, link, beside))
         undo.callback(session.close)
         with ExitStack() as running:
             for recorder in recorders:
@@ -154,8 +155,11 @@ def _tell_changes(recorders: "list[MachineRecorder]", told: dict[Path, str]) -> 
 
 def _settings(
     config: Path | None, machines: list[str] | None, changes: Mapping[str, str | float | None]
-) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings]":
-    """Machines, recording and history settings; the command line overrides the settings file."""
+) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings, LinkSettings | None]":
+    """Machines, recording and history settings, and a link to the streams of the monitor with that settings file.
+
+    The command line overrides the settings file.
+    """
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.mistakes import checked  # noqa: PLC0415
     from service.settings.service import RecordingSettings, load_settings  # noqa: PLC0415
@@ -173,7 +177,10 @@ def _settings(
     for root in roots:
         if roots.count(root) > 1:
             raise MachineFileError(f"two of the machine files describe {root}")
-    return loaded, recording, settings.history
+    # A client of what the monitor connects to, or of the monitor itself; names that it accepts are not the recorder's.
+    ends = {"mode": "client", "listen": (), "connect": settings.link.connect or settings.link.listen}
+    beside = None if config is None else settings.link.model_copy(update=ends | {"grants": (), "passwords_file": None})
+    return loaded, recording, settings.history, beside
 
 
 def _summed_up(recorders: "list[MachineRecorder]") -> bool:

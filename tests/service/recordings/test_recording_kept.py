@@ -279,7 +279,7 @@ def test_a_separate_recorder_keeps_recordings_only_for_alarms_in_the_history(tmp
     address, folder = endpoint(), tmp_path / "kept" / "demo" / "lab"
     with monitor_running(tmp_path, address, machine_file(tmp_path, PATIENT)) as monitor:
         monitor.url()
-        plan = ["--config", str(tmp_path / "monitor.toml"), "--out", str(tmp_path / "kept"), "--connect", address]
+        plan = ["--config", str(tmp_path / "monitor.toml"), "--out", str(tmp_path / "kept")]
         history = f"sqlite:///{tmp_path / 'history.sqlite'}"
 
         def record(kind: str) -> dict[str, str]:
