@@ -81,29 +81,57 @@ def test_faint_lines_leave_all_hops_settled() -> None:
 RATE_HZ, SHAFT_HZ = 500.0, 22.0
 
 
+TIME_S = np.arange(round(62.5 * RATE_HZ)) / RATE_HZ
+HOP = round(HOP_S * RATE_HZ)
+
+
+def heard(angle: FloatArray, snr: float | FloatArray) -> FloatArray:
+    """Two channels of a minute, in white noise, of a shaft at these angles."""
+    noise = np.random.default_rng(SEED).standard_normal((2, TIME_S.size))
+    return np.asarray(snr * np.cos(angle - [[0.0], [1.0]]) + noise, dtype=np.float64)
+
+
 def hunting(part: float, every_s: float, snr: float = 1.0) -> tuple[FloatArray, FloatArray]:
-    """Two channels of a minute in white noise, and the angle of a shaft whose speed swings by `part`."""
-    rng = np.random.default_rng(SEED)
-    t_s = np.arange(round(62.5 * RATE_HZ)) / RATE_HZ
-    angle = 2 * np.pi * SHAFT_HZ * (t_s - part * every_s / (2 * np.pi) * np.cos(2 * np.pi * t_s / every_s))
-    return snr * np.cos(angle - [[0.0], [1.0]]) + rng.standard_normal((2, t_s.size)), angle
+    """The channels, and the angle of a shaft whose speed swings by `part`."""
+    angle = 2 * np.pi * SHAFT_HZ * (TIME_S - part * every_s / (2 * np.pi) * np.cos(2 * np.pi * TIME_S / every_s))
+    return heard(angle, snr), angle
+
+
+def found_in(channels: FloatArray) -> tuple[RotationLine, ...]:
+    """The line of each hop, with half of a hop before it."""
+    parts = (channels[:, first : first + HOP + HOP // 2] for first in range(0, TIME_S.size - HOP // 2 - HOP + 1, HOP))
+    return tuple(sure(rotation_line(part, RATE_HZ, 2 * np.pi * SHAFT_HZ, 0.05)) for part in parts)
 
 
 @pytest.mark.parametrize("every_s", [2.0, 3.3, 5.0, 6.5, 20.0])
 @pytest.mark.parametrize("part", [0.01, 0.03])
 def test_a_speed_that_hunts_is_followed_within_a_hop(part: float, every_s: float) -> None:
     channels, angle = hunting(part, every_s)
-    hop, found = round(HOP_S * RATE_HZ), []
-    for first in range(0, angle.size - hop // 2 - hop + 1, hop):  # a hop with half of one before it
-        part_of = slice(first, first + hop + hop // 2)
-        line = sure(rotation_line(channels[:, part_of], RATE_HZ, 2 * np.pi * SHAFT_HZ, 0.05))
-        t_s = np.arange(hop + hop // 2) / RATE_HZ
-        off = np.unwrap(line.angle(t_s - t_s.mean() - 0.5 / RATE_HZ) - angle[part_of])
-        assert np.std(off) < 0.35
-        found.append(line)
-    speeds = sure(followed_speeds(tuple(found), HOP_S))
+    found, t_s = found_in(channels), TIME_S[: HOP + HOP // 2]
+    for number, line in enumerate(found):
+        true = angle[number * HOP : number * HOP + t_s.size]
+        assert np.std(np.unwrap(line.angle(t_s - t_s.mean() - 0.5 / RATE_HZ) - true)) < 0.35
+    speeds = sure(followed_speeds(found, HOP_S))
     assert np.isfinite(speeds).all()
-    assert settled_hops(tuple(found), speeds, HOP_S).all()
+    assert settled_hops(found, speeds, HOP_S).all()
+
+
+@pytest.mark.parametrize(("part", "ramp_s"), [(0.004, 1.0), (0.013, 5.0), (-0.02, 14.0)])
+def test_hops_in_which_a_drive_begins_or_ends_a_ramp_are_not_settled(part: float, ramp_s: float) -> None:
+    begin_s = 29.0
+    ramped_s = np.clip(TIME_S - begin_s, 0.0, ramp_s)
+    after_s = np.clip(TIME_S - begin_s - ramp_s, 0.0, None)
+    angle = 2 * np.pi * SHAFT_HZ * (TIME_S + part * (ramped_s**2 / (2 * ramp_s) + after_s))
+    lines = found_in(heard(angle, 10.0))
+    bends = {int(at_s // HOP_S) for at_s in (begin_s, begin_s + ramp_s)}
+    settled = settled_hops(lines, sure(followed_speeds(lines, HOP_S)), HOP_S)
+    assert bends <= set(np.flatnonzero(~settled).tolist()) <= {*range(min(bends) - 1, max(bends) + 2)}
+
+
+def test_a_line_that_changes_at_one_speed_leaves_all_hops_settled() -> None:
+    angle = 2 * np.pi * SHAFT_HZ * TIME_S + np.where(TIME_S > 33.0, 0.5, 0.0)
+    lines = found_in(heard(angle, np.where(TIME_S > 33.0, 14.0, 10.0)))
+    assert settled_hops(lines, sure(followed_speeds(lines, HOP_S)), HOP_S).all()
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.003, 0.02, 0.05])

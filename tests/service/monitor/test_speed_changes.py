@@ -76,6 +76,13 @@ def test_without_a_phase_reference_a_drive_is_judged_at_each_set_point(machine: 
     assert states.count(HealthState.HEALTHY) >= len(states) - 1
 
 
+def test_without_a_phase_reference_a_slight_ramp_is_no_misfit() -> None:
+    change = Event(at_s=66.0, speed_rpm=0.992 * RPM, ramp_s=3.0)
+    windows, alarms = watched(at_once(WITHOUT_ANGLE), WITHOUT_ANGLE, 83.0, change)
+    assert not alarms
+    assert {window.state for window in windows if window.filled == 1.0} == {HealthState.HEALTHY}
+
+
 def drive(seed: int, *events: Event, duration_s: float = 75.0) -> list[SampleBlock]:
     scenario = load_scenario("healthy")[0].model_copy(update={"seed": seed, "events": events, "duration_s": duration_s})
     return [block for block, _ in blocks(scenario, WITHOUT_ANGLE)]
