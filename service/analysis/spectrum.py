@@ -146,7 +146,9 @@ class Waterfall:
             raise RotorwatchError(f"--axis speed needs a run-up or coast-down: {text}; --axis time shows it")
         slowest, fastest = float(speed.min()), float(speed.max())
         count = min(_MOST_SPEEDS, max(2, speed.size // 2))
-        edges = np.linspace(slowest, fastest, count + 1)
+        # Classes are centred on the slowest and the fastest speed, at which a machine stays longest.
+        half = (fastest - slowest) / (count - 1) / 2
+        edges = np.linspace(slowest - half, fastest + half, count + 1)
         place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, count - 1)
         mean = np.full((count, self.frequencies_hz.size), np.nan)
         for number in range(count):

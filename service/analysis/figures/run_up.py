@@ -55,7 +55,7 @@ def bode(
         raise RotorwatchError(f"a Bode plot needs a run-up or coast-down: {text}")
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
-    figure = Figure(figsize=look.size_in or (5.6 * columns if columns > 1 else 8.0, 0.8 + 4.4 * rows))
+    figure = Figure(figsize=look.size_in or (5.6 * columns if columns > 1 else 10.4, 0.8 + 4.4 * rows))
     figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)
     grid = figure.add_gridspec(
         3 * rows - 1, columns, height_ratios=([0.01 if found.estimated else 1.0, 1.4, 0.08] * rows)[:-1]
@@ -120,7 +120,7 @@ def polar(
     found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
-    figure = Figure(figsize=look.size_in or (max(8.0, 5.2 * columns), 0.9 + 5.6 * rows))
+    figure = Figure(figsize=look.size_in or (10.4, 0.9 + 5.6 * rows))
     figure.set_layout_engine("constrained")
     direction = found.direction
     panels = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "polar"}).ravel()

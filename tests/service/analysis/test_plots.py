@@ -193,6 +193,8 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
     strongest_hz = found.frequencies_hz[spectra[known].argmax(axis=1)]
     assert (strongest_hz > slow_hz - 0.76).all()
     assert (strongest_hz < fast_hz + 0.76).all()
+    slowest, *_, fastest = (edges[:-1] + edges[1:]) / 2
+    assert (slowest, fastest) == pytest.approx((found.speed_rad_s[0], found.speed_rad_s[-1]))
 
 
 def test_correlation_panels_agree_with_the_report(faulty: Path, lines: list[dict[str, object]]) -> None:

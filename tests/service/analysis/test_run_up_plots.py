@@ -227,6 +227,13 @@ def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Recorded]) 
     assert lower.get_title(loc="right").startswith("greatest: 2")
 
 
+@pytest.mark.parametrize("plot", [bode, polar])
+def test_the_heading_fits_above_a_single_channel(run_up: tuple[int, Recorded], plot: Callable[..., Figure]) -> None:
+    figure = drawn(plot(Look(), run_up[1], ["y2"], 1, 4, None))
+    widest = max(text.get_window_extent().x1 for text in figure.texts)
+    assert widest < figure.bbox.x1
+
+
 def test_the_slow_roll_vector_is_subtracted(tmp_path: Path) -> None:
     """A shaft with 3 µm of run-out, and 10 µm of vibration half a turn later at high speed."""
 
