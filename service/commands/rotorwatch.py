@@ -308,8 +308,9 @@ def demo(
 
 
 def _checked(file: Path) -> str:
-    """Check a file, and return a description of its contents."""
+    """Check a file, and return a description of its contents, with a line for each doubt."""
     from models.commissioning.commissioned import Installed, install, knowledge_of  # noqa: PLC0415  # keeps --help quick
+    from models.doubts import doubts  # noqa: PLC0415
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
     from service.access.tls import lapses, tls_context  # noqa: PLC0415
@@ -326,23 +327,24 @@ def _checked(file: Path) -> str:
         spectra = f"{lengths}, {low_hz:g} to {high_hz:g} Hz"
         found = f"machine {machine.title}, {channels}; {spectra}; knowledge level {known.level}: {known.text}"
         levels = machine.levels
-        if levels.reference == "commissioned" or (levels.reference is None and not Installed(machine).watching):
-            return found
-        first = f"the first {levels.reference_windows} windows, {levels.reference_windows * window.length_s:g} s"
-        return f"{found}; levels are compared with {first}{'' if levels.reference else ', until it is commissioned'}"
+        if levels.reference == "first windows" or (levels.reference is None and Installed(machine).watching):
+            first = f"the first {levels.reference_windows} windows, {levels.reference_windows * window.length_s:g} s"
+            found += f"; levels are compared with {first}{'' if levels.reference else ', until it is commissioned'}"
+        return "\n  doubtful: ".join((found, *doubts(machine)))
     settings = load_settings(file)
-    names = []
+    names, doubtful = [], []
     for entry in settings.machines:
         machine = entry.load()
         install(machine, entry.bundle)
         names.append(machine.title)
+        doubtful += [f"{machine.title}: {one}" for one in doubts(machine)]
     # Check the files and environment variables that the monitor reads at its start.
     settings.link.zenoh_items()
     Webhooks(settings.webhooks)
     if settings.access.tls is not None:
         tls_context(settings.access.tls)
     told = (f"settings for {', '.join(names)}", *lapses(settings), _not_listening(settings.http.host))
-    return "; ".join(filter(None, told))
+    return "\n  doubtful: ".join(("; ".join(filter(None, told)), *doubtful))
 
 
 def _not_listening(host: str) -> str:
