@@ -24,7 +24,15 @@ _ALARM, _NO_DATA, _NO_ANSWER = 1, 3, 4
 _SUMMARY = {0: "well", _ALARM: "alarm", _NO_DATA: "no-data", _NO_ANSWER: "no-answer"}
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
 _WIDEST, _FOLDED = 1000, 16
-_SILENT = ("shelved", "suppressed", "out-of-service")
+_QUIET = {
+    "shelved": "",
+    "suppressed": "",
+    "out-of-service": "",
+    "returned": ", cleared, to be acknowledged",
+    "latched-unacknowledged": ", cleared, to be acknowledged and reset",
+    "latched-acknowledged": ", cleared, to be reset",
+}
+"""States of alarms that are not normal but do not count as raised, with the words that explain them."""
 _STYLES = {
     "danger": "bold red",
     "alert": "bold yellow",
@@ -114,7 +122,8 @@ def status(
     evaluable). 1: an alarm is raised on a machine. 3: none is raised, but the
     data of a machine have stopped. 4: the monitor does not answer, or refuses
     the token. 2: an argument that cannot be used. Reasons, and alarms that are
-    shelved, suppressed or out of service, are listed below the table.
+    shelved, suppressed, out of service, or cleared and waiting for an operator,
+    are listed below the table.
 
     [bold]Examples[/bold]
 
@@ -158,7 +167,8 @@ def status(
         remarks += [f"{place}: the publisher's channel descriptor differs from the file: {differs}"] if differs else []
         growth = None if health.report is None else health.report.level_growth
         remarks += [] if growth is None else [f"{place}: {growth.text}"]
-        remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
+        quiet = [alarm for alarm in health.alarms if alarm.state in _QUIET]
+        remarks += [f"{place}: {alarm.name} is {alarm.state}{_QUIET[alarm.state]}" for alarm in quiet]
     # Only machine names are folded, to no less than `_FOLDED` characters, so lines may exceed the terminal's width.
     longest = max((len(f"{health.site}/{health.machine}") for health in healths), default=0)
     least = Console(width=_WIDEST).measure(table).maximum - max(0, longest - _FOLDED)

@@ -139,6 +139,10 @@ def test_status_distinguishes_stopped_data_from_an_alarm(tmp_path: Path) -> None
         until(lambda: "stream-lost" in {one.name for one in worker.alarms().alarms if one.raised}, "the silence")
         worker.descriptor(worker.machine.descriptor.model_dump_json().replace('"um"', '"mm"', 1).encode())
         found, table = (run("status", "--url", runtime.http_url, *more) for more in (["--json"], []))
+        feed.put_good()
+        until(lambda: "returned" in {one.state for one in worker.alarms().alarms}, "the end of the silence")
+        cleared = run("status", "--url", runtime.http_url)
+    assert "demo/lab: stream-lost is returned, cleared, to be acknowledged" in cleared.stdout
     assert "differs from the file: channels.0.unit (y1) is 'mm', expected 'um'" in table.stdout
     assert found.returncode == table.returncode == 3
     said = json.loads(found.stdout)
