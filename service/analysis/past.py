@@ -1,6 +1,6 @@
 """Reads one machine's reports, each with the levels of its window, from the history of a monitor."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +8,11 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from models.errors import MachineFileError, RotorwatchError
+from models.levels.limits import unit_of
 from models.machine import MachineFile
-from models.signals.channels import ChannelDescriptor
+from models.signals.channels import UNIT_TO_SI, ChannelDescriptor
 from rotorwatch.records.health import Report
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelBound, LevelLimits
 from service.analysis.recorded import Described
 from service.history.database import Database
 from service.history.shared import ReportLog, alarms_since
@@ -47,7 +49,8 @@ class Past(Described):
             If there are no reports.
         """
         texts = log.texts(since_ns or 0, _LATEST_NS if until_ns is None else until_ns, most)
-        reports = tuple(parsed_reports(texts))
+        units = _units(machine)
+        reports = tuple(in_units(one, units) for one in parsed_reports(texts))
         name = machine.title
         if not reports:
             raise RotorwatchError(f"{name}: no reports in this stretch of time")
@@ -90,7 +93,8 @@ class Past(Described):
                 for text, other, option in zip(between, (first, last + 1), ("--from", "--to"), strict=True)
             )
             alarms = alarms_since(database, machine.site, machine.name, 0)
-            reports = tuple(parsed_reports(log.texts(since, until, _MOST)))
+            units = _units(machine)
+            reports = tuple(in_units(one, units) for one in parsed_reports(log.texts(since, until, _MOST)))
         finally:
             database.stop()
         if not reports:
@@ -104,3 +108,42 @@ def parsed_reports(texts: Iterable[str | bytes]) -> Iterator[Report]:
     for text in texts:
         with suppress(ValidationError):  # from another version of the program
             yield Report.model_validate_json(text)
+
+
+def in_units(report: Report, units: Mapping[str, str]) -> Report:
+    """Convert the levels of a report to other units, by channel; left out where the channel was of another quantity.
+
+    So levels from before and after a change of the machine file are comparable.
+    """
+    if all(one.unit == units.get(one.channel, one.unit) for one in report.levels):
+        return report
+    levels = (_converted(one, units.get(one.channel, one.unit)) for one in report.levels)
+    return report.model_copy(update={"levels": tuple(one for one in levels if one is not None)})
+
+
+def _converted(levels: ChannelLevels, unit: str) -> ChannelLevels | None:
+    known = next((factors for factors in UNIT_TO_SI.values() if {levels.unit, unit} <= set(factors)), None)
+    if known is None:
+        return None
+    factor = known[levels.unit] / known[unit]
+    pp = levels.detection == "peak to peak"
+    scaled = {name for name in LEVEL_MEASURES if unit_of(levels.unit, name, pp) != unit_of(unit, name, pp)}
+    values = {name: value * factor for name in scaled if (value := getattr(levels, name)) is not None}
+    limits = (_times(one, factor) if one.measure in scaled else one for one in levels.limits)
+    return levels.model_copy(update={"unit": unit, "limits": tuple(limits), **values})
+
+
+def _times(limit: LevelLimits, factor: float) -> LevelLimits:
+    def scaled(one: LevelLimits | LevelBound) -> dict[str, float]:
+        known = {name: getattr(one, name) for name in ("alert", "danger", "fall")}
+        return {name: value * factor for name, value in known.items() if value is not None}
+
+    bounds = (
+        one.model_copy(update={"zones": one.zones and tuple(factor * zone for zone in one.zones), **scaled(one)})
+        for one in limit.bounds
+    )
+    return limit.model_copy(update={"bounds": tuple(bounds), **scaled(limit)})
+
+
+def _units(machine: MachineFile) -> dict[str, str]:
+    return {sensor.name: sensor.unit for sensor in machine.sensors}

@@ -20,7 +20,7 @@ from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import MEASURES, HealthState, Report
 from rotorwatch.records.levels import LEVEL_MEASURES
-from service.analysis.past import Past, parsed_reports
+from service.analysis.past import Past, in_units, parsed_reports
 from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
 from service.recordings.replay.offline import OfflineReplay, choose_machine
@@ -139,6 +139,8 @@ def trend_of(
         while ordered and ordered[-1].end_ns >= report.end_ns:
             ordered.pop()  # if runs overlap in time, the one recorded last is shown
         ordered.append(report)
+    units = {one.channel: one.unit for report in ordered for one in report.levels}  # the latest of each channel
+    ordered = [in_units(report, units) for report in ordered]
     series = {name: np.full((3, len(ordered)), np.nan) for name in PARAMETER_TEXT}
     for number, report in enumerate(ordered):
         verdict = report.verdict

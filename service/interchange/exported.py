@@ -41,6 +41,7 @@ _Row = dict[str, object]
 class _Levels(BaseModel):
     """The part of a report that determines its columns."""
 
+    end_ns: int
     levels: tuple[ChannelLevels, ...] = ()
 
 
@@ -125,21 +126,31 @@ def report_table(selection: Selection) -> Table:
         for value, meaning in _READINGS.items()
     ]
     fields += _level_fields(selection)
+    fields += [
+        _field("bundle", pa.string(), "", "bundle in use; empty without one"),
+        _field("machine_hash", pa.string(), "", "hash of the machine file in use"),
+    ]
     return _message_table(selection, selection.keys.report, fields, _report_row, "end_ns")
 
 
 def _level_fields(selection: Selection) -> list[pa.Field]:
-    """A column for each level of each channel that occurs in any report."""
+    """A column for each level of each channel that occurs in any report; refused if its unit changes."""
     found: dict[str, pa.Field] = {}
     for message in selection.source.messages({selection.keys.report}):
         with suppress(ValidationError):  # reported when its row is read
-            for levels in _Levels.model_validate_json(message.payload).levels:
+            report = _Levels.model_validate_json(message.payload)
+            for levels in report.levels if selection.wants(report.end_ns) else ():
                 pp = levels.detection == "peak to peak"
                 for measure in _level_values(levels):
                     unit = "deg" if measure.endswith("_deg") else unit_of(levels.unit, measure, pp) or "1"
                     text = f"{levels.channel}: {ChannelLevels.model_fields[measure].description}"
                     name = f"{levels.channel}.{measure}"
-                    found.setdefault(name, _field(name, pa.float64(), unit, text))
+                    column = found.setdefault(name, _field(name, pa.float64(), unit, text))
+                    if (before := column.metadata[b"unit"].decode()) != unit:
+                        raise RecordingError(
+                            f"the unit of {name} has changed from {before} to {unit} at {rfc3339(report.end_ns)}; "
+                            "export what is before and after that by itself, with --to-time and --from"
+                        )
     return list(found.values())
 
 

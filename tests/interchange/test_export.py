@@ -20,7 +20,7 @@ from models.signals.wire import encode_arrow, encode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
-from service.interchange.exported import stream_table
+from service.interchange.exported import report_table, stream_table
 from service.interchange.exporting import ExportFormat, export
 from tests.interchange.material import START_NS, imported, selected, stretches
 
@@ -164,6 +164,26 @@ def test_reports_and_alarms_are_exported_as_tables(tmp_path: Path) -> None:
     content = loadmat(tmp_path / "reports.mat", simplify_cells=True)["data"]
     assert content["state"]["samples"].tolist() == [report.state] * 3
     assert np.isnan(content["e_relative_change"]["samples"]).all()
+
+
+def test_reports_in_another_unit_are_exported_by_themselves(tmp_path: Path) -> None:
+    recording(tmp_path / "run.mcap", blocks=2)
+    report = Report.model_validate(example(Report))
+    later_ns = START_NS + 12_000_000_000
+    levels = [one.model_copy(update={"unit": "g"}) for one in report.levels]
+    later = report.model_copy(update={"end_ns": later_ns, "levels": tuple(levels)})
+    with RecordingWriter(tmp_path / "later.mcap") as writer:
+        payload = later.model_dump_json().encode()
+        writer.write(RecordedMessage(LAB.keys.report, payload, b"", "application/json", later_ns, later_ns))
+    both = tmp_path / "run.mcap", tmp_path / "later.mcap"
+    with pytest.raises(
+        RecordingError, match=r"DE-H\.overall has changed from m/s2 rms to g rms at 2026-01-31T12:00:12"
+    ):
+        export(selected(*both), "reports", "csv", tmp_path / "out.csv")
+    table = report_table(selected(*both, from_ns=later_ns))
+    assert table.schema.field("DE-H.overall").metadata[b"unit"] == b"g rms"
+    (rows,) = table.batches
+    assert rows.column("machine_hash").to_pylist() == [report.machine_hash]
 
 
 def test_channels_that_change_are_exported_by_themselves(tmp_path: Path) -> None:

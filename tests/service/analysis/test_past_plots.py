@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from models.errors import RotorwatchError
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report
-from rotorwatch.records.levels import ChannelLevels
+from rotorwatch.records.levels import ChannelLevels, LevelBound, LevelLimits
 from service.analysis.orbit import recorded_pairs
-from service.analysis.past import Past
+from service.analysis.past import Past, in_units
 from service.analysis.runup import read_centreline, read_run_up
-from service.analysis.trend import past_trend
+from service.analysis.trend import past_trend, trend_of
 from service.commands.rotorwatch import app
 from service.history.records import Step, StoredReport
 from tests.service.rig.postgres import opened
@@ -70,6 +70,25 @@ def test_vectors_and_centrelines_of_the_history_are_those_of_the_reports(setting
     assert line.z_um == pytest.approx(np.stack([100.0 + number, 300.0 + number], axis=1))
     assert line.time_ns.tolist() == [START_NS + (30 + 5 * one) * S for one in range(COUNT)]
     assert past_trend(data, levels=True).levels[0].level.tolist() == [50.0] * COUNT
+
+
+def test_levels_from_before_a_change_of_unit_are_converted(settings: Path) -> None:
+    data = Past.find(settings, None, (None, None))
+    bound = LevelBound(source="own limit", zones=(1.0, 2.0, 3.0), alert=2.0)
+    limit = LevelLimits(measure="overall", alert=2.0, source="own limit", state="alert", bounds=(bound,))
+    first, *others = data.reports[0].levels
+    mils = first.model_copy(update={"unit": "mil", "overall": 1.0, "peak": 3.0, "x1": 1.0, "limits": (limit,)})
+    speed = first.model_copy(update={"channel": "z1", "unit": "mm/s"})
+    before = data.reports[0].model_copy(update={"levels": (mils, speed, *others[1:])})
+    shown = trend_of([before, *data.reports[1:]], (), None, "", levels=True).levels
+    assert shown[0].title == "y1   overall, µm pp"
+    assert (*shown[0].level[:2], shown[0].alert[0]) == pytest.approx((25.4, 50.0, 50.8))
+    (other,) = (one for one in shown if one.title.startswith("z1"))
+    assert np.isnan(other.level[0])  # it was a velocity
+    assert other.level[1] == 50
+    converted = in_units(before, {"y1": "um"}).levels[0]
+    assert (converted.peak, converted.x1, converted.crest) == pytest.approx((76.2, 25.4, first.crest))
+    assert converted.limits[0].bounds[0].zones == pytest.approx((25.4, 50.8, 76.2))
 
 
 def test_a_part_of_the_history_and_data_that_it_lacks(settings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
