@@ -75,21 +75,42 @@ def sensor_findings(
         findings += exchanged
         leads = {} if reference is None else {(one.first, one.second): one.lead_rad_s for one in reference.pairs}
         compared = [one for one in read_pairs(window, pairs, bands, leads) if one.pair not in explained]
-    readings: list[PairReading] = []
-    for reading in compared:
-        states = reading.first, reading.second
-        known = None if reference is None else reference.pair(*states)
-        if reading.shared >= BROKEN * (known or PERFECT).shared:
-            readings.append(reading)
-        elif "theta" not in bad:  # or the synchronous part is still there, and its run-out is in the displacement alone
-            text = (
-                f"{naming.name(states[1])} and {naming.name(states[0])} measure the same motion but share only "
-                f"{reading.shared:.2f} of it, expected nearly 1: noise, a loose sensor, or a wrong channel"
-            )
-            findings.append(SensorFault(states=states, kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
+
+    faults = _incoherent(window, naming, compared, reference)
+    broken = {one.states for one in faults}
+    readings = [one for one in compared if (one.first, one.second) not in broken]
+    if "theta" not in bad:  # else the synchronous part is still there, and its run-out is in the displacement alone
+        findings += faults
     findings += gain_and_delay(window, readings, naming, reference)
     findings += of_others(gain_jump(window, naming))  # of channels that are in no reading
     bad = implicated(findings)
     if "theta" not in bad:  # the synchronous part that a wrong angle leaves in the spectra looks like noise
         findings += noisy(window, readings, naming, reference, bad)
     return tuple(findings)
+
+
+def _incoherent(
+    window: WindowStatistics, naming: Naming, compared: Sequence[PairReading], reference: SensorReference | None
+) -> list[SensorFault]:
+    """Pairs that share less of their motion than healthy ones."""
+
+    def expected(one: PairReading) -> float:
+        known = None if reference is None else reference.pair(one.first, one.second)
+        return (known or PERFECT).shared
+
+    found = [one for one in compared if one.shared < BROKEN * expected(one)]
+    cause = "noise, a loose sensor, or a wrong channel"
+    if len(found) == len(compared) and not np.isfinite(window.hop_speed_rad_s).any():
+        cause += "; or the machine stands, as no rotation is found"
+    return [
+        SensorFault(
+            states=(one.first, one.second),
+            kind=FaultKind.INCOHERENT,
+            text=(
+                f"{naming.name(one.second)} and {naming.name(one.first)} measure the same motion but share only "
+                f"{one.shared:.2f} of it, expected nearly 1: {cause}"
+            ),
+            value=one.shared,
+        )
+        for one in found
+    ]

@@ -127,6 +127,20 @@ def test_healthy_sensors_are_left_alone_under_any_excitation(name: str, one_sour
         assert sensor_findings(window) == sensor_findings(window, reference_of(name)) == ()
 
 
+def test_noise_alone_may_be_a_machine_at_a_standstill() -> None:
+    """Without a shaft angle, and before the machine has run, nothing else tells."""
+    plan, rng = plan_for(load_machine("lab"), lagged=False), np.random.default_rng(3)
+    noise = rng.standard_normal((round(63 * plan.rate_hz), len(plan.states))) * recorded("lab", 1)[:, :-1].std(axis=0)
+    (window,) = windows_of(replace(plan, angle_column=None), noise)
+    found = sensor_findings(window, None, load_machine("lab").sensors)
+    assert {one.kind for one in found} == {"incoherent"}
+    assert all(one.text.endswith("or the machine stands, as no rotation is found") for one in found)
+    shaken = recorded("lab", 1)[:, :-1].copy()
+    shaken[:, column("y1")] = noise[: len(shaken), column("y1")]
+    (window,) = windows_of(replace(plan, angle_column=None), shaken)
+    assert not any("stands" in one.text for one in sensor_findings(window, None, load_machine("lab").sensors))
+
+
 @pytest.mark.parametrize("state", ["y1", "z2_dot"])
 def test_a_stuck_sensor_is_named_with_its_value_and_duration(state: str) -> None:
     samples = recorded("lab", 1).copy()
