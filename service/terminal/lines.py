@@ -115,9 +115,13 @@ def health_line(health: Health) -> str:
     >>> from rotorwatch.records.example import example
     >>> health_line(Health.model_validate(example(Health)))
     '00:03:25  demo/lab  state is alert'
+    >>> health_line(Health.model_validate(example(Health) | {"reason": "the machine is at a standstill"}))
+    '00:03:25  demo/lab  state is alert; latest window: the machine is at a standstill'
     """
     at = "--:--:--" if health.report is None else _clock(health.report.end_ns)
-    why = f": {health.reason}" if health.reason else ""
+    # An alarm explains itself; the reason is then why the latest window says nothing, or little.
+    link = "; latest window" if health.state in {"alert", "danger"} else ""
+    why = f"{link}: {health.reason}" if health.reason else ""
     return f"{at}  {health.site}/{health.machine}  state is {health.state}{why}"
 
 
