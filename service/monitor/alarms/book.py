@@ -292,8 +292,7 @@ class AlarmBook:
         """
         events: list[AlarmEvent] = []
         ruled = [name for rule in self._settings.suppress for name in rule.alarms]
-        left = [alarm.name for alarm in self.alarms if alarm.rules]
-        for name in dict.fromkeys((*ruled, *left)):
+        for name in dict.fromkeys((*ruled, *(alarm.name for alarm in self.alarms if alarm.rules))):
             alarm = self._alarm_named(name, time_ns)
             about = [rule for rule in self._settings.suppress if name in rule.alarms]
             holding = [rule for rule in about if self._applies(rule, alarm, speed_rpm)]
