@@ -36,9 +36,9 @@ _FEW_HOPS = 6  # fewer hops need lines that stand out by themselves
 _HELD, _HELD_PART = 4, 0.5
 # Strength of a hop's line relative to the other hops' up to which a part of the hop had another speed.
 _WEAKER = 0.25
-# How many times as far as usual the speeds of two hops are apart where they meet if a ramp begins or ends there; errors
-# of the lines alone reach six times in one pair of ten thousand.
-_BENT = 8.0
+# How many times as far as usual the speeds of two hops are apart where they meet if a ramp begins or ends there, and
+# from which strength on: weaker lines may be as far apart by chance, and leave little behind.
+_BENT, _BENT_STRENGTH = 5.0, 60.0
 # Power of a hop's parts over that of the whole, less one, from which on the speed may swing, and which the swing must
 # recover; the same where the line is weak; and what noise makes of it, times the strength.
 _SPREAD, _SPREAD_OF_WEAK, _OF_NOISE, _PARTS = 0.1, 0.8, 10.0, 8
@@ -281,7 +281,9 @@ def settled_hops(lines: tuple[RotationLine | None, ...], followed: FloatArray, h
     level = steady & (np.minimum(strength[1:], strength[:-1]) > _WEAKER * np.maximum(strength[1:], strength[:-1]))
     as_it_was = np.append(steady, level[-1:]) & np.insert(steady, 0, level[:1])
     settled = found & (as_it_was | (strength > _WEAKER * usual))
-    held &= settled[1:] & settled[:-1] & ~_bent(lines, steps, hop_s)
+    held &= settled[1:] & settled[:-1]
+    if usual > _BENT_STRENGTH:
+        held &= ~_bent(lines, steps, hop_s)
     return np.asarray(settled & np.append(held, True) & np.insert(held, 0, True), dtype=np.bool_)
 
 
