@@ -15,7 +15,7 @@ from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window.motion import motion_pairs
 from models.diagnosis.window.statistics import WindowStatistics
 from models.signals.block import BoolArray, FloatArray
-from models.signals.waveform import stacked_waveform
+from models.signals.waveform import CountArray, stacked_waveform
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
@@ -36,6 +36,7 @@ STEP_PART = 0.3  # part of the channel's rms that it must exceed, too
 DRIFT_PART = 3.0
 # The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages.
 MOVED_PART = 3.0
+_SLOWER = 0.9  # of the speed beside it, below which the rest of a hop with a constant angle is a start or a stop
 _FEWEST_DROPPED = 3  # least number of hops with drop-outs for a finding; fewer do not affect the readings
 _SHAFT_PART = 0.3  # if another displacement moves by more than this part of a displacement's step, the shaft has moved
 
@@ -43,7 +44,8 @@ _SHAFT_PART = 0.3  # if another displacement moves by more than this part of a d
 def stuck(window: WindowStatistics, naming: Naming, stood: BoolArray) -> Iterator[SensorFault]:
     """Channels that hold a value or show nothing but their quantisation, and a shaft angle that does not turn.
 
-    The angle need not turn in the hops of `stood`, shape (n_hops,), in which the machine stood or was running down.
+    The angle need not turn in the hops of `stood`, shape (n_hops,), in which the machine stood or was running down, nor
+    throughout a hop in which it starts or stops.
     """
     hops = window.hop_waveform
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
@@ -52,7 +54,7 @@ def stuck(window: WindowStatistics, naming: Naming, stood: BoolArray) -> Iterato
         runs, rms, step = hops.longest_run[:, column], hops.rms[:, column], hops.step[:, column]
         name, coarse = naming.name(state), rms < step
         if state == "theta":
-            runs = np.where(stood, 0, runs)
+            runs = np.where(stood | _starts_or_stops(window, runs), 0, runs)
         whole = int(np.sum(runs[runs >= hops.n_samples]))
         lost_s = max(whole, int(runs.max())) / rate_hz
         if state != "theta" and np.any(coarse):
@@ -77,6 +79,17 @@ def stuck(window: WindowStatistics, naming: Naming, stood: BoolArray) -> Iterato
                 f"expected to change within {STILL_S:g} s: the sensor or its line is stuck"
             )
         yield SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=lost_s)
+
+
+def _starts_or_stops(window: WindowStatistics, still: CountArray) -> BoolArray:
+    """Hops in a part of which the angle stands, and in the rest turns slower than beside them, shape (n_hops,).
+
+    An angle that is lost for a while turns as fast as before in the rest.
+    """
+    speeds = np.abs(window.hop_speed_rad_s)
+    beside = np.fmax(np.append(speeds[1:], np.nan), np.append(np.nan, speeds[:-1]))
+    moving = window.hop_waveform.n_samples - still
+    return np.asarray((moving > 0) & (speeds * window.hop_waveform.n_samples < _SLOWER * beside * moving))
 
 
 def dropped(window: WindowStatistics, naming: Naming) -> Iterator[SensorFault]:

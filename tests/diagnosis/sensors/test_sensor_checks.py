@@ -127,6 +127,21 @@ def test_healthy_sensors_are_left_alone_under_any_excitation(name: str, one_sour
         assert sensor_findings(window) == sensor_findings(window, reference_of(name)) == ()
 
 
+@pytest.mark.parametrize("backwards", [False, True])
+def test_an_angle_that_stands_still_only_while_the_machine_starts_or_stops_is_not_lost(backwards: bool) -> None:
+    """Against a reference that is lost for as long, at the same vibration."""
+    rate_hz, samples = plan_of("lab").rate_hz, recorded("lab", 1).copy()
+    time_s = np.arange(len(samples)) / rate_hz
+    starting = np.where(time_s < 4.0, 0, np.minimum((time_s - 4.0) / 7.0, 1))  # 1 s in the first hop, 7 s of run-up
+    speed_hz = 22.0 * (starting[::-1] if backwards else starting)
+    samples[:, -1] = 2 * np.pi * np.cumsum(speed_hz) / rate_hz % (2 * np.pi)
+    assert not [one.text for one in found_in(samples) if "stood still" in one.text]
+    samples[:, -1] = 2 * np.pi * 22.0 * time_s % (2 * np.pi)
+    lost = slice(round(4.0 * rate_hz), round(6.0 * rate_hz))
+    samples[lost, -1] = samples[lost.start, -1]
+    assert "stood still for 2 s" in only(found_in(samples)).text
+
+
 def test_noise_alone_may_be_a_machine_at_a_standstill() -> None:
     """Without a shaft angle, and before the machine has run, nothing else tells."""
     plan, rng = plan_for(load_machine("lab"), lagged=False), np.random.default_rng(3)
