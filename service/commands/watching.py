@@ -131,6 +131,8 @@ def status(
 
     [cyan]rotorwatch status --json | jq -r '.machines[] | .machine + " " + .state'[/cyan]
     """
+    from service.terminal.lines import reason_of  # noqa: PLC0415  # keeps --help quick
+
     healths, code, why = [], _NO_ANSWER, ""
     try:
         healths = _fetch_healths(url, token, ca, certificate)
@@ -162,7 +164,7 @@ def status(
             str(sum(health.quality.refused_blocks.values())),
             str(health.quality.gaps),
         )
-        remarks += [f"{place}: {health.reason}"] if health.reason else []
+        remarks += [f"{place}: {reason_of(health)}"] if health.reason else []
         differs = "; ".join(health.stream.descriptor_mismatch)
         remarks += [f"{place}: the publisher's channel descriptor differs from the file: {differs}"] if differs else []
         growth = None if health.report is None else health.report.level_growth

@@ -121,8 +121,21 @@ def health_line(health: Health) -> str:
     at = "--:--:--" if health.report is None else _clock(health.report.end_ns)
     # An alarm explains itself; the reason is then why the latest window says nothing, or little.
     link = "; latest window" if health.state in {"alert", "danger"} else ""
-    why = f"{link}: {health.reason}" if health.reason else ""
+    reason = reason_of(health)
+    why = f"{link}: {reason}" if reason else ""
     return f"{at}  {health.site}/{health.machine}  state is {health.state}{why}"
+
+
+def reason_of(health: Health) -> str:
+    """The reason of a state, without the name of the machine, which stands before it.
+
+    Examples
+    --------
+    >>> from rotorwatch.records.example import example
+    >>> reason_of(Health.model_validate(example(Health) | {"reason": "demo/lab: speed is 900 rpm"}))
+    'speed is 900 rpm'
+    """
+    return health.reason.removeprefix(f"{health.site}/{health.machine}: ")
 
 
 def _alarm_detail(alarm: Alarm) -> str:
