@@ -7,13 +7,16 @@ const [BEGINS, ENDS] = [new Set(["raised", "escalated"]), new Set(["cleared", "r
 /** @import { AlarmEventData as AlarmEvent } from "../monitor/records.d.ts" */
 /** @typedef {{from: number, to: number, severity: string, text: string}} Spell */
 
-/** Times during which an alarm was raised, from its events, oldest first. @param {AlarmEvent[]} events @param {number} end @returns {Spell[]} */
-function spells(events, end) {
+/** Times during which an alarm was raised, from its events, oldest first; it may have been raised before the first of them. @param {AlarmEvent[]} events @param {number} start @param {number} end @returns {Spell[]} */
+export function spells(events, start, end) {
   /** @type {Spell[]} */
   const found = [];
   /** @type {Spell | null} */
   let open = null;
   for (const one of events) {
+    if (!found.length && (one.kind === "cleared" || one.kind === "escalated")) {
+      found.push({ from: start, to: one.time_ns, severity: one.kind === "cleared" ? one.severity : "alert", text: "raised before" });
+    }
     if (open && (BEGINS.has(one.kind) || ENDS.has(one.kind))) {
       open.to = one.time_ns;
       open = null;
@@ -30,7 +33,7 @@ export function timeLine(events, now) {
   const x = (/** @type {number} */ ns) => (WIDTH * (ns - first)) / (end - first || 1);
   const names = [...new Set(events.map((one) => one.name))];
   const rows = names.flatMap((name) => {
-    const stood = spells(events.filter((one) => one.name === name).reverse(), end);
+    const stood = spells(events.filter((one) => one.name === name).reverse(), first, end);
     if (!stood.length) return [];
     const bars = stood.map((one) => {
       const from = Math.min(x(one.from), WIDTH - LEAST);

@@ -157,3 +157,21 @@ def test_dates_along_an_axis_have_the_order_of_other_dates(tmp_path: Path) -> No
     )
     done = run_deno(tmp_path, "run", "--allow-read", str(script))
     assert json.loads(done.stdout) == [["", "04:54\n11-30", "04:55"], ["\n11-30"]], done.stderr
+
+
+def test_an_alarm_raised_before_the_oldest_event_loaded_is_on_the_time_line(tmp_path: Path) -> None:
+    script, module = tmp_path / "ask.js", STATES.parents[1] / "alarms" / "alarm-time-line.js"
+    script.write_text(
+        "globalThis.localStorage = { getItem: () => null };\n"
+        f'const {{ spells }} = await import("{module.as_uri()}");\n'
+        'const events = (...kinds) => kinds.map((kind, at) => ({ kind, time_ns: 10 * at, severity: "danger" }));\n'
+        'const asked = [["shelved", "cleared"], ["shelved", "escalated", "cleared"], ["raised", "cleared"]];\n'
+        "const told = asked.map((kinds) => spells(events(...kinds), -5, 90));\n"
+        "console.log(JSON.stringify(told.map((bars) => bars.map((one) => [one.from, one.to, one.severity]))));"
+    )
+    done = run_deno(tmp_path, "run", "--allow-read", str(script))
+    assert json.loads(done.stdout or "0") == [
+        [[-5, 10, "danger"]],
+        [[-5, 10, "alert"], [10, 20, "danger"]],
+        [[0, 10, "danger"]],
+    ], done.stderr
