@@ -345,9 +345,7 @@ class AlarmBook:
         self._must_be_as_seen(alarm, operation)
         kind = KIND_OF_EVENT[operation.kind]
         if follow(alarm.state, kind, present=alarm.present, latching=alarm.name in self._settings.latching) is None:
-            normal = kind is EventKind.ACKNOWLEDGED and alarm.state is AlarmState.NORMAL
-            hint = " (acknowledge needs an alarm that has been raised)" if normal else ""
-            raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible{hint}")
+            raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible")
         if kind in {EventKind.SHELVED, EventKind.REMOVED_FROM_SERVICE} and not operation.reason.strip():
             raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected an explanation")
         actor, reason = operation.actor, operation.reason
