@@ -81,7 +81,10 @@ class WindowReporter:
         levels.take(samples, implicated(dead))
         if statistics is None:
             return self._while_it_fills(end_ns, there, dead, standing=bool(stood))
-        findings = sensor_findings(statistics, self._sensors, self._machine.sensors, missing, standing=bool(stood))
+        findings = sensor_findings(
+            samples.settled() if statistics.passed else statistics,  # what a ramp leaves behind looks like a delay
+            self._sensors, self._machine.sensors, missing, standing=bool(stood),
+        )  # fmt: skip
         if not stood and "theta" not in implicated(findings):
             findings += levels.rewired()
         lost, start_ns, faulty = self.evaluator.spared(self._plan, findings), statistics.start_ns, implicated(findings)

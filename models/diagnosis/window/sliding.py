@@ -24,7 +24,6 @@ import numpy as np
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.window.excluded import KnownLine
 from models.diagnosis.window.moments import HopMoments, Plan, hop_moments
-from models.diagnosis.window.rotation import LEAST_SETTLED
 from models.diagnosis.window.statistics import WindowStatistics, levels_of, window_statistics
 from models.errors import CheckpointError
 from models.levels.measures import WindowLevels
@@ -370,7 +369,6 @@ class SlidingWindow:
         @cache
         def judged() -> WindowStatistics:
             whole = made()
-            left_out = not whole.settled.all() and whole.settled.mean() >= LEAST_SETTLED
-            return made(settled=True) if left_out else whole
+            return made(settled=True) if whole.passed else whole
 
         return judged

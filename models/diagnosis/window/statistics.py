@@ -30,7 +30,7 @@ from models.diagnosis.window.moments import (
     turns,
 )
 from models.diagnosis.window.motion import pair_bands
-from models.diagnosis.window.rotation import relative_vectors
+from models.diagnosis.window.rotation import LEAST_SETTLED, relative_vectors
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import BoolArray, ComplexArray, FloatArray
 from models.signals.waveform import Waveform, stacked_waveform
@@ -135,6 +135,11 @@ class WindowStatistics:
     def rotation_vectors(self) -> ComplexArray | None:
         """Rotation-synchronous vectors of each hop, each from an angle that may be its own; None if unknown."""
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
+
+    @property
+    def passed(self) -> bool:
+        """Whether some hops are not `settled`, but enough others are to judge the window without them."""
+        return bool(LEAST_SETTLED <= self.settled.mean() < 1)
 
     @cached_property
     def line_bins(self) -> BoolArray:

@@ -83,6 +83,24 @@ def test_without_a_phase_reference_a_slight_ramp_is_no_misfit() -> None:
     assert {window.state for window in windows if window.filled == 1.0} == {HealthState.HEALTHY}
 
 
+def test_without_a_phase_reference_a_ramp_is_no_delay_of_a_sensor() -> None:
+    rotor = {
+        "m1_kg": 22.1, "m2_kg": 18.3, "I2_kg_m2": 0.00321, "I2p_kg_m2": 0.00642, "shaft_length_m": 0.14,
+        "shaft_diameter_m": 0.0226, "k_by_N_per_m": 1.6e5, "k_bz_N_per_m": 1.43e5, "c_by_N_s_per_m": 406.0,
+        "c_bz_N_s_per_m": 499.0, "e_m": 4.16e-5,
+    }  # fmt: skip
+    machine = WITHOUT_ANGLE.model_copy(
+        update={
+            "rotor": LAB.rotor.model_copy(update=rotor),
+            "operation": LAB.operation.model_copy(update={"speed_rpm": 2220.0}),
+        }
+    )
+    change = Event(at_s=67.0, speed_rpm=1.02 * 2220.0, ramp_s=8.0)
+    windows, alarms = watched(at_once(machine), machine, 83.0, change)
+    assert not alarms
+    assert not [fault for window in windows for fault in window.sensors]
+
+
 def drive(seed: int, *events: Event, duration_s: float = 75.0) -> list[SampleBlock]:
     scenario = load_scenario("healthy")[0].model_copy(update={"seed": seed, "events": events, "duration_s": duration_s})
     return [block for block, _ in blocks(scenario, WITHOUT_ANGLE)]
