@@ -369,6 +369,6 @@ class SlidingWindow:
         @cache
         def judged() -> WindowStatistics:
             whole = made()
-            return made(settled=True) if whole.passed else whole
+            return made(settled=True) if whole.partly_settled else whole
 
         return judged

@@ -137,7 +137,7 @@ class WindowStatistics:
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
 
     @property
-    def passed(self) -> bool:
+    def partly_settled(self) -> bool:
         """Whether some hops are not `settled`, but enough others are to judge the window without them."""
         return bool(LEAST_SETTLED <= self.settled.mean() < 1)
 
