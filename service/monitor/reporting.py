@@ -82,7 +82,7 @@ class WindowReporter:
         if statistics is None:
             return self._while_it_fills(end_ns, there, dead, standing=bool(stood))
         findings = sensor_findings(
-            samples.settled() if statistics.partly_settled else statistics,  # what a ramp leaves behind looks like a delay
+            samples.settled() if statistics.partly_settled else statistics,  # what a ramp leaves looks like a delay
             self._sensors, self._machine.sensors, missing, standing=bool(stood),
         )  # fmt: skip
         if not stood and "theta" not in implicated(findings):
